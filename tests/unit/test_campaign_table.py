@@ -57,7 +57,7 @@ def flown() -> list[Group]:
     return groups(rows)
 
 
-def test_best_is_the_lowest_median_of_those_that_all_flew_and_its_equals(
+def test_best_groups_have_the_lowest_median_without_failures(
     flown: list[Group],
 ) -> None:
     """Median and range of a group count only the flights that landed."""
@@ -70,7 +70,7 @@ def test_best_is_the_lowest_median_of_those_that_all_flew_and_its_equals(
     assert lost.reasons == {WHY: [3]}
 
 
-def test_a_value_names_a_group_where_it_differs() -> None:
+def test_group_names_show_only_differing_values() -> None:
     def name(drawn: frozenset[str]) -> list[str]:
         case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
         rows = [
@@ -83,7 +83,7 @@ def test_a_value_names_a_group_where_it_differs() -> None:
     assert name(frozenset({"a.c"})) == ["lqr"]
 
 
-def test_no_line_of_the_table_is_wider_than_the_window(flown: list[Group]) -> None:
+def test_table_fits_the_terminal_width(flown: list[Group]) -> None:
     text = io.StringIO()
     show(Console(file=text, width=80), flown)
     told = text.getvalue().splitlines()
@@ -95,7 +95,7 @@ def test_no_line_of_the_table_is_wider_than_the_window(flown: list[Group]) -> No
     assert f"seed 1, 2, 3: {WHY}" in " ".join(whole.split())
 
 
-def test_the_page_shows_every_group_and_the_worst_flights_without_a_network(
+def test_campaign_page_opens_offline_and_shows_all_groups(
     flown: list[Group], tmp_path: Path
 ) -> None:
     file = tmp_path / "campaign.html"
@@ -123,7 +123,7 @@ def test_the_page_shows_every_group_and_the_worst_flights_without_a_network(
         (4, "pso lqr", "pso lqr"),  # aborted
     ],
 )
-def test_on_one_vehicle_nothing_is_flown_after_a_refused_or_aborted_flight(
+def test_campaign_on_one_vehicle_stops_after_a_refusal_or_abort(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exit_code: int, begun: str, rows: str
 ) -> None:
     flown: list[str] = []
@@ -179,7 +179,9 @@ class Empty:
         ({"max_position_m": 500.0}, ("error", LOWEST)),
     ],
 )
-def test_margin(changes: dict[str, float], expected: tuple[str, float]) -> None:
+def test_margin_is_that_of_the_weakest_promise(
+    changes: dict[str, float], expected: tuple[str, float]
+) -> None:
     figures = {
         "max_position_m": 0.0, "tilt_max_deg": 0.0, "link_delay_p99_ms": 0.0,
         "at_bound_share": 0.0, "touchdown_mps": 0.5, "completed": 1.0, **changes,
@@ -189,7 +191,7 @@ def test_margin(changes: dict[str, float], expected: tuple[str, float]) -> None:
     assert (weakest, found[weakest]) == (expected[0], pytest.approx(expected[1]))
 
 
-def test_a_case_has_a_directory_of_its_own_and_if_connected_begins_disarmed() -> None:
+def test_connected_cases_begin_disarmed_in_separate_directories() -> None:
     """Two files of the same name get two directories; a given `limits.begin_armed` is kept."""
     case = Case("flight", "lqr", "hover", None, None, "px4", "connected", 1, link="udpin::0")
     armed = replace(case, values=(("limits.begin_armed", True),))

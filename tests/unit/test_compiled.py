@@ -88,7 +88,7 @@ def machine_code(cache: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in cache.rglob("*.nbc")}
 
 
-def test_compiled_once_and_again_when_another_file_has_changed(
+def test_functions_are_recompiled_when_an_imported_file_changes(
     package: Path, tmp_path: Path
 ) -> None:
     cache = tmp_path / "cache"
@@ -103,15 +103,13 @@ def test_compiled_once_and_again_when_another_file_has_changed(
     assert answer(package, **given).startswith("72.0\n")
 
 
-def test_without_compilation_the_same_functions_run_as_python(
-    package: Path, tmp_path: Path
-) -> None:
+def test_functions_run_as_python_without_compilation(package: Path, tmp_path: Path) -> None:
     given = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "NUMBA_DISABLE_JIT": "1"}
     assert answer(package, **given).startswith("68.0\n1 [2, 10] ")
     assert not machine_code(tmp_path)
 
 
-def test_the_directory_is_below_the_first_usable_one(package: Path, tmp_path: Path) -> None:
+def test_cache_directory_is_below_the_first_usable_one(package: Path, tmp_path: Path) -> None:
     """A relative path is not used, as the XDG standard demands."""
     code = "from offboard import compiled; print(compiled.directory())"
     first, second, home = (tmp_path / name for name in ("numba", "xdg", "home"))

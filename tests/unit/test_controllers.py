@@ -56,7 +56,7 @@ def test_flight_yaml_states_every_setting_with_its_default_and_range() -> None:
 
 
 @pytest.mark.parametrize("part", shipped.PARTS)
-def test_the_ends_of_the_ranges_that_shipped_files_state_are_allowed(part: str) -> None:
+def test_stated_ranges_of_shipped_files_are_accepted(part: str) -> None:
     """A lower end of 0 may be refused, because it may mean "greater than 0"."""
     stated, refused = 0, []
     for name, side in itertools.product(shipped.names(part), (1, 2)):
@@ -90,7 +90,7 @@ def test_reset_gives_the_decisions_of_a_new_controller(law: str) -> None:
 
 @pytest.mark.parametrize("law", [law for law in names() if law != "autopilot"])
 @pytest.mark.parametrize("field", ["position_ned_m", "velocity_ned_mps", "thrust_direction_ned"])
-def test_a_state_that_is_not_finite_gives_no_decision(law: str, field: str) -> None:
+def test_non_finite_state_raises_decision_error(law: str, field: str) -> None:
     reference = lemniscate(8.0)
     state = state_of(np.random.default_rng(0), reference, 0.1)
     for broken in (math.nan, math.inf):
@@ -109,7 +109,7 @@ def test_the_deadline_cuts_the_swarm_short(law: str) -> None:
     assert (certificate.cut_short, certificate.iterations) == (True, 75)
 
 
-def test_an_error_that_stays_is_answered_ever_more_by_the_integral() -> None:
+def test_pid_integral_grows_while_an_error_stays() -> None:
     """An error of 5 cm adds in 3 s 0.03 m/s^2 along north and east, and 0.15 along the vertical."""
     for axis, off in enumerate(0.05 * np.eye(3)):
         law, situation = law_named("pid"), Situation(0.0, at(off, 0.0), hold((0, 0, 0), 0.0), LEVEL)
@@ -119,7 +119,7 @@ def test_an_error_that_stays_is_answered_ever_more_by_the_integral() -> None:
         assert more == pytest.approx(np.diag((0.03, 0.03, 0.15))[axis], abs=1e-9)
 
 
-def test_the_autopilots_loop_is_given_the_reference() -> None:
+def test_autopilot_law_sends_the_reference() -> None:
     heading = np.radians(-179.9)
     reference = lemniscate(8.0, heading_rad=heading, vertical_m=0.3)
     situation = Situation(6.0, at((0, 0, -3), heading), reference, LEVEL)
@@ -145,7 +145,7 @@ def test_the_autopilots_loop_is_given_the_reference() -> None:
         ({"choices": {"vehicle": "arducopter"}}, "arducopter"),
     ],
 )
-def test_vehicle_is_neutral_unless_one_is_named_or_the_simulator_flies_its_own(
+def test_vehicle_file_defaults_to_neutral_or_the_simulated_one(
     asked: dict[str, Any], expected: str
 ) -> None:
     firmware, name = asked.pop("firmware", None), asked.pop("name", "flight")

@@ -69,7 +69,7 @@ def problems(text: str) -> tuple[str, ...]:
     return caught.value.problems
 
 
-def test_scalars_are_those_of_yaml_1_2() -> None:
+def test_scalars_follow_yaml_1_2() -> None:
     numbers = {"1e-3": 1e-3, "1E3": 1e3, "-2.5e+1": -25.0, ".5": 0.5, "3.": 3.0, "010": 10.0,
                "0x10": 16.0}  # fmt: skip
     for text, number in numbers.items():
@@ -144,7 +144,7 @@ def test_each_problem_is_one_sentence_with_its_place(text: str, sentence: str) -
     assert problems(text) == tuple(place + line for line in sentence.splitlines())
 
 
-def test_a_description_is_read_and_is_no_part_of_the_value() -> None:
+def test_description_is_read_but_not_part_of_the_value() -> None:
     text = "description: a drawing\ntitle: x"
     assert parse(text, Drawing, "d.yaml") == Drawing(title="x")
     assert read(text, "d.yaml").description == "a drawing"
@@ -155,7 +155,7 @@ def test_a_description_is_read_and_is_no_part_of_the_value() -> None:
         assert problem.endswith("should be text of at most 200 characters")
 
 
-def test_override_sets_a_copy() -> None:
+def test_override_changes_a_copy() -> None:
     raw = read("title: x\nshape: {kind: line, points: 3}\ncorner: [1, 2]", "d.yaml")
     changed = override(override(raw, "shape.points=4"), "corner.1=1e-1")
     changed = override(changed, "named.sun={kind: circle, radius_m: 2}")
@@ -166,7 +166,7 @@ def test_override_sets_a_copy() -> None:
     assert raw == {"title": "x", "shape": {"kind": "line", "points": 3}, "corner": [1, 2]}
 
 
-def test_a_bad_override_is_refused_with_the_same_sentences() -> None:
+def test_bad_override_is_refused() -> None:
     raw = read("title: x\ncorner: [1, 2]", "d.yaml")
     assert override(raw, "title=a=b")["title"] == "a=b"
     for assignment, sentence in (
@@ -209,7 +209,7 @@ def written(path: Path, text: str, mode: int = 0o600) -> Path:
     return path
 
 
-def test_a_new_key_is_private_random_and_the_hash_of_its_passphrase(tmp_path: Path) -> None:
+def test_new_key_is_private_random_and_a_passphrase_hash(tmp_path: Path) -> None:
     before = os.umask(0o777)  # the most restrictive umask
     try:
         passphrases = [create_key(tmp_path / name) for name in "ab"]
@@ -225,7 +225,7 @@ def test_a_new_key_is_private_random_and_the_hash_of_its_passphrase(tmp_path: Pa
     assert read_key(tmp_path / "a") == key
 
 
-def test_a_file_that_cannot_be_written_whole_is_not_left(tmp_path: Path) -> None:
+def test_incomplete_key_file_is_removed(tmp_path: Path) -> None:
     with full_disk(20), pytest.raises(UserError, match="cannot be created: File too large"):
         create_key(tmp_path / "key")
     assert not (tmp_path / "key").exists()
@@ -240,7 +240,7 @@ def test_a_file_that_cannot_be_written_whole_is_not_left(tmp_path: Path) -> None
         ("passphrase: a: b, c and d: e\r\n", hashlib.sha256(b"a: b, c and d: e").digest()),
     ],
 )
-def test_both_forms_are_read(text: str, key: bytes, tmp_path: Path) -> None:
+def test_key_and_passphrase_files_are_read(text: str, key: bytes, tmp_path: Path) -> None:
     assert read_key(written(tmp_path / "key", text)) == key
 
 
@@ -259,7 +259,7 @@ def test_both_forms_are_read(text: str, key: bytes, tmp_path: Path) -> None:
         "key: \xff",
     ],
 )
-def test_what_is_no_key_is_refused_without_showing_it(text: str, tmp_path: Path) -> None:
+def test_invalid_key_is_refused_without_showing_it(text: str, tmp_path: Path) -> None:
     with pytest.raises(UserError) as refused:
         read_key(written(tmp_path / "key", text))
     sentence = str(refused.value)
@@ -268,7 +268,7 @@ def test_what_is_no_key_is_refused_without_showing_it(text: str, tmp_path: Path)
     assert not any(each in sentence for each in (SECRET, SECRET[:-1], "fifteen letters"))
 
 
-def test_what_is_no_private_file_is_refused_without_waiting(tmp_path: Path) -> None:
+def test_key_file_must_be_private_and_regular(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo", 0o600)
     large = written(tmp_path / "large", "#" * (SIZE_MOST + 1))
     modes = (0o640, 0o604, 0o620, 0o601)

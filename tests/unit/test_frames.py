@@ -48,7 +48,7 @@ def test_euler_angles_survive_gimbal_lock() -> None:
         assert angle_between(quaternion, again) < 1e-13
 
 
-def test_conversions_are_scipys_of_one_and_of_arrays() -> None:
+def test_conversions_agree_with_scipy_for_single_values_and_arrays() -> None:
     """One quaternion and an array (5, 100) are converted alike; the heading is that of the nose."""
     nose, many = RANDOM.apply([1.0, 0.0, 0.0]), QUATERNIONS.reshape(5, 100, 4)
     euler = RANDOM.as_euler("ZYX")[:, ::-1]
@@ -70,7 +70,7 @@ def test_conversions_are_scipys_of_one_and_of_arrays() -> None:
 
 
 @given(angles, st.floats(0, math.pi), angles, st.floats(0.01, 100))
-def test_attitude_from_thrust_direction_has_both(
+def test_attitude_has_the_given_thrust_direction_and_heading(
     azimuth: float, tilt: float, heading: float, length: float
 ) -> None:
     """For any b, also upside down, the body's z axis is b and the nose points along the heading."""
@@ -87,7 +87,7 @@ def test_attitude_from_thrust_direction_has_both(
 
 
 @given(st.floats(-1e6, 1e6))
-def test_wrap_keeps_the_angle_and_the_range(angle: float) -> None:
+def test_wrap_pi_keeps_the_angle_within_pi(angle: float) -> None:
     wrapped = wrap_pi(angle)
     assert -math.pi <= wrapped <= math.pi
     assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-9)
@@ -107,7 +107,7 @@ def unit(place: Geodetic) -> np.ndarray:
 
 @pytest.mark.parametrize("origin", [Geodetic(-35.36, 149.17, 584.0), Geodetic(78, -179.99)])
 @pytest.mark.parametrize(("north_deg", "east_deg"), [(0, -2e-5), (-0.1, 0.05)])
-def test_distance_and_bearing_are_the_sphere_s(
+def test_distance_and_bearing_agree_with_the_sphere(
     origin: Geodetic, north_deg: float, east_deg: float
 ) -> None:
     place = Geodetic(origin[0] + north_deg, origin[1] + east_deg, 3.0)

@@ -62,7 +62,7 @@ def closed_form(law: HorizonLaw) -> Plan:
     return law.fly(np.zeros((steps, 3)), np.zeros((steps + 1, STATE_SIZE)))[0]
 
 
-def test_near_a_hover_quadratic_roll_outs_and_closed_form_cost_the_same() -> None:
+def test_quadratic_rollout_and_closed_form_costs_agree_near_hover() -> None:
     law, rng = horizon(), np.random.default_rng(2)
     for situation in about_hover(5, 1e-4):
         problem = law.quadratic.over(law.prepare(situation), law.outlook)
@@ -73,7 +73,7 @@ def test_near_a_hover_quadratic_roll_outs_and_closed_form_cost_the_same() -> Non
         assert closed_form(law).cost == pytest.approx(left_to_pay(law, situation), rel=1e-3)
 
 
-def test_a_plan_whose_cost_is_not_finite_never_wins() -> None:
+def test_plan_with_a_non_finite_cost_never_wins() -> None:
     law = horizon()
     law.prepare(situations(1, 0.3)[0])
     knots = np.zeros((2, *law.reach.shape))
@@ -82,7 +82,7 @@ def test_a_plan_whose_cost_is_not_finite_never_wins() -> None:
     assert (int(np.argmin(costs)), costs[0]) == (1, math.inf)
 
 
-def test_the_quadratic_leaves_the_cost_to_go_and_has_the_bounds_of_one_decision() -> None:
+def test_unbounded_quadratic_optimum_is_the_lqr() -> None:
     """With terminal cost P, N optimal inputs cost x'Px for every N, and the first one is -K x."""
     law = horizon()
     for situation in situations(5, 0.3):
@@ -125,7 +125,7 @@ def _flown(state: PredictedState, plan: np.ndarray) -> np.ndarray:
     return x
 
 
-def test_nonlinear_roll_outs_fly_as_scipy_does() -> None:
+def test_nonlinear_rollouts_agree_with_scipy() -> None:
     """After 1 s of tilts up to 0.2 and thrusts up to 3 m/s^2 about a hover that leans by 15
     degrees, position and velocity agree within 4 mm and 10 mm/s."""
     state = replace(
@@ -149,7 +149,7 @@ def test_nonlinear_roll_outs_fly_as_scipy_does() -> None:
     assert rolled[T] + np.linalg.norm(pull) == pytest.approx(true[10], abs=1e-3)
 
 
-def test_a_plan_of_zeros_flies_the_reference() -> None:
+def test_zero_plan_flies_the_reference() -> None:
     reference, law = lemniscate(8.0, vertical_m=0.4), horizon()
     start = state_of(np.random.default_rng(0), reference, 0.0)
     state = on_target(start, law.target(reference, 5.0, start))
@@ -159,7 +159,7 @@ def test_a_plan_of_zeros_flies_the_reference() -> None:
     assert plan.cost < 1e-12
 
 
-def test_mpc_is_lqr_where_no_bound_is_met_and_sees_one_coming_where_it_is() -> None:
+def test_mpc_equals_lqr_only_away_from_bounds() -> None:
     mpc, closed = MpcLaw(PX4, MpcSettings(bandwidth_radps=5.0)), lqr()
     for situation in situations(20, 0.1):
         ours, theirs = mpc.decide(situation).command, closed.decide(situation).command
@@ -189,7 +189,7 @@ def test_law_finds_cheaper_plans_than_a_random_search() -> None:
     assert np.median(ours / drawn) < 0.5
 
 
-def test_a_way_below_the_clearance_to_the_ground_costs() -> None:
+def test_plan_near_the_ground_is_penalised() -> None:
     """Below 0.3 m a plan pays 20 per metre and second, and 200 per square metre and second. A
     descent from 0.8 m and its mirror image differ in cost by that alone."""
     law = horizon(keep_out=[IN_THE_WAY])
@@ -204,7 +204,7 @@ def test_a_way_below_the_clearance_to_the_ground_costs() -> None:
     assert low.cost - high.cost == pytest.approx(paid, rel=1e-9)
 
 
-def test_the_deadline_ends_with_a_plan_no_worse_than_the_base() -> None:
+def test_plan_at_the_deadline_is_no_worse_than_the_base() -> None:
     remaining_s = iter(range(4, -1000, -1))
     (situation,) = situations(1, 0.3)
     law = horizon(keep_out=[IN_THE_WAY])

@@ -56,7 +56,7 @@ def fit_response(*measured, delay: Estimate | None = None, wanders=False) -> Res
     return completed(attitude_fit.fit_response(problem, delay))
 
 
-def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
+def test_innovations_are_white_with_unit_variance():
     """The simulated speed, disturbance and rate of the wander are driven by noise of the densities
     that the filter assumes."""
     generator = np.random.default_rng(11)
@@ -99,7 +99,7 @@ def test_standard_deviations_agree_with_repeated_fits():
     assert ((rms > 0.5) & (rms < 1.8)).all(), rms
 
 
-def test_standard_deviations_of_a_heading_whose_errors_wander():
+def test_standard_deviations_allow_for_a_wandering_heading():
     """Sixty records of 5.4 s with one double step, as in the phase EXCITE; the heading's error
     walks as PX4's, 16 mrad per root second. The residuals alone give 40 % of the delay's sd."""
     true, sent_at = (0.15, 3.1, 0.4), np.arange(0.0, 5.4, 0.1)
@@ -116,7 +116,7 @@ def test_standard_deviations_of_a_heading_whose_errors_wander():
     assert ((rms > 0.7) & (rms < 1.5)).all(), rms
 
 
-def test_delay_known_beforehand_counts_by_its_uncertainty():
+def test_prior_delay_is_weighted_by_its_uncertainty():
     """An uncertain prior changes nothing; a certain one is adopted and improves the frequency."""
     sent_at, values = steps(5)
     times = np.arange(0.3, 5.9, 0.01)
@@ -190,7 +190,7 @@ def test_every_constant_is_identified():
     assert applied.tilt.damping == values["tilt_damping"]
 
 
-def test_a_velocity_that_contradicts_the_positions_is_told() -> None:
+def test_velocity_that_contradicts_positions_is_measured() -> None:
     """The reported velocity is wrong by up to 0.4 m/s for seconds."""
     true, told_mps = flown(), []
     for wrong_mps in (0.0, 0.4):
@@ -201,7 +201,7 @@ def test_a_velocity_that_contradicts_the_positions_is_told() -> None:
     assert 0.2 < told_mps[1] < 0.4
 
 
-def test_constant_that_the_flight_does_not_determine_is_refused():
+def test_undetermined_constants_are_refused():
     """Hovering without steps determines the hover thrust alone."""
     found = identify(flown(tilt=0.0, heading=0.0, thrust_step=0.0), VEHICLE_FILE)
     for name, words in (

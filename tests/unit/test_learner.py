@@ -52,7 +52,7 @@ def estimate_with(found: Identified) -> VehicleEstimate:
     return estimate
 
 
-def test_what_a_file_may_have_is_adopted_and_nothing_else() -> None:
+def test_identified_values_are_adopted_only_within_file_limits() -> None:
     for frequency, damping, hover_thrust in ((0.5, 6.0, 0.02), (60.0, 0.1, 0.95)):
         tilt = AxisResponse(delay_s=0.5, natural_frequency_radps=frequency, damping=damping)
         constants = {"hover_thrust": hover_thrust, "tilt": tilt}
@@ -74,7 +74,7 @@ def test_what_a_file_may_have_is_adopted_and_nothing_else() -> None:
         assert estimate_with(found).contradiction.endswith("allowed), not adopted")
 
 
-def test_doubt_ends_with_what_explains_the_flight() -> None:
+def test_doubt_ends_once_constants_explain_the_flight() -> None:
     """A fit that leaves too much unexplained is refused, the next one is adopted. Once the
     constants in use explain the flight again, a fit that explains no more is refused."""
     unknown = VehicleEstimate(FILE, delay_error_s=UNKNOWN_DELAY_S).uncertainty
@@ -110,7 +110,7 @@ def effect_s(vehicle: Vehicle) -> float:
     return vehicle.thrust_delay_s + vehicle.thrust_lag_s
 
 
-def test_a_later_fit_of_the_thrust_is_adopted_if_it_is_more_certain_or_twice_another() -> None:
+def test_thrust_fit_is_replaced_if_more_certain_or_contradicted_twice() -> None:
     estimate = estimate_with(fit(0.05))
     for found_s, sd_s, used_s, used_sd_s in (
         (0.10, 0.02, 0.10, 0.02),  # the first
@@ -129,7 +129,7 @@ def test_a_later_fit_of_the_thrust_is_adopted_if_it_is_more_certain_or_twice_ano
         assert estimate.uncertainty.thrust_s == pytest.approx(3.0 * used_sd_s)
 
 
-def test_a_drag_is_replaced_by_a_vague_one_only_if_that_contradicts_it_twice() -> None:
+def test_uncertain_drag_needs_two_contradictions_to_be_adopted() -> None:
     """On a circle of 8 m/s on a real PX4 a first fit in motion, 1.19 +- 0.15, replaced the 1.03
     +- 0.02 of the climb, and the position error was 0.28 m."""
     estimate = estimate_with(fit(0.05))
@@ -156,7 +156,7 @@ def test_a_drag_is_replaced_by_a_vague_one_only_if_that_contradicts_it_twice() -
         assert estimate.vehicle.drag_per_mass_ps == pytest.approx(used_ps), found_ps
 
 
-def test_neither_tilt_nor_contradiction_changes_an_identified_thrust() -> None:
+def test_identified_thrust_is_kept_when_the_tilt_changes() -> None:
     estimate = estimate_with(fit(0.24))
     assert estimate.vehicle.thrust_delay_s == pytest.approx(FILE.thrust_delay_s + 0.2)
     estimate.review_thrust(thrust_fit(0.30), 5.0)
@@ -168,7 +168,7 @@ def test_neither_tilt_nor_contradiction_changes_an_identified_thrust() -> None:
     assert effect_s(estimate.vehicle) == pytest.approx(0.30)
 
 
-def test_another_delay_is_adopted_once_something_else_shows_it_too() -> None:
+def test_new_tilt_delay_needs_a_second_confirmation() -> None:
     """A new delay needs a second fit, or contradicting telemetry that the new fit explains."""
     estimate = estimate_with(fit(0.05))
     estimate.review_tilt(fit(0.25), AGREES, 10.0)
@@ -185,7 +185,7 @@ def test_another_delay_is_adopted_once_something_else_shows_it_too() -> None:
         assert estimate.vehicle.tilt.delay_s == adopted_s
 
 
-def test_after_two_contradictions_the_delay_is_unknown_for_20_s_of_calm() -> None:
+def test_delay_stays_unknown_20_s_after_two_contradictions() -> None:
     """This holds if later fits show another delay, too. A further contradiction restarts it."""
     estimate, delay_s = estimate_with(fit(0.05)), 0.09
     for begun_s in (10.0, 20.0):
@@ -205,7 +205,7 @@ def test_after_two_contradictions_the_delay_is_unknown_for_20_s_of_calm() -> Non
     assert not estimate.in_doubt  # the first of a new count
 
 
-def test_doubt_about_the_tilt_leaves_the_other_constants() -> None:
+def test_doubt_about_the_tilt_keeps_other_constants() -> None:
     """Delays that were set with the tilt's return to the file's; identified constants are kept."""
     tilt = fit(0.15).tilt
     found = Identified(
@@ -231,7 +231,7 @@ def test_doubt_about_the_tilt_leaves_the_other_constants() -> None:
     assert own.vehicle == FILE.model_copy(update={"thrust_delay_s": 0.05})
 
 
-def test_a_link_is_in_every_delay_and_its_changes_make_them_uncertain() -> None:
+def test_link_delay_adds_to_all_delays_and_growth_to_uncertainty() -> None:
     estimate = VehicleEstimate(FILE, delay_error_s=UNKNOWN_DELAY_S)
     assert estimate.result is None
     estimate.on_link_delay(Estimate(0.124, 0.01))
@@ -247,7 +247,7 @@ def test_a_link_is_in_every_delay_and_its_changes_make_them_uncertain() -> None:
     assert estimate.uncertainty.tilt_s == pytest.approx(KNOWN_S)
 
 
-def test_delays_of_a_remembered_vehicle_follow_the_link_over_many_flights() -> None:
+def test_stored_delays_follow_the_link_over_flights() -> None:
     """The link's delay falls from 204 to 108 ms in steps of 24 ms, less than the 30 ms that count
     as a change; one flight ends before it is measured. The vehicle's own delays stay the same."""
     own_s, at_s = 0.053, 0.204
@@ -269,7 +269,7 @@ def test_delays_of_a_remembered_vehicle_follow_the_link_over_many_flights() -> N
 
 
 @pytest.mark.parametrize(("from_s", "to_s"), [(0.2, 0.004), (0.004, 0.6)])
-def test_no_link_moves_a_delay_out_of_its_limits(from_s: float, to_s: float) -> None:
+def test_link_delay_keeps_delays_within_limits(from_s: float, to_s: float) -> None:
     """First a thrust delay of 190 ms was identified over a link of 200 ms, which is now 4 ms; then
     the link has 600 ms and the file's thrust acts later than its tilt. Later fits are adopted."""
     slow = FILE.model_copy(update={"thrust_delay_s": 0.1})
@@ -285,7 +285,7 @@ def test_no_link_moves_a_delay_out_of_its_limits(from_s: float, to_s: float) -> 
         Vehicle.model_validate(each.vehicle.model_dump())
 
 
-def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_learner_announces_contradictions_and_hover_thrust(monkeypatch: pytest.MonkeyPatch) -> None:
     """A lasting contradiction is announced twice, though every new fit seems to explain the flight,
     a short one never. The observer's hover thrust is announced if it differs by more than 6 % and
     is within bounds."""
@@ -325,7 +325,7 @@ def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch
         assert sum(line.startswith("identified hover thrust") for line in said) == (used != 0.42)
 
 
-def test_steps_end_where_they_began_and_outside_the_box() -> None:
+def test_steps_return_to_their_start_and_stop_outside_the_box() -> None:
     """The tilts by 2 degrees to either side, integrated twice, leave the vehicle where it was."""
     learner = Learner(FILE, IdentifySettings(box_m=0.5))
     learner.on_stage(Stage.STEPS, 10.0)
@@ -343,7 +343,7 @@ def test_steps_end_where_they_began_and_outside_the_box() -> None:
     assert learner.excited(level, 10.1, 0.0) == level  # the steps have ended for this flight
 
 
-def test_without_identification_the_file_is_flown_and_nothing_is_recalled() -> None:
+def test_disabled_identification_flies_the_vehicle_file() -> None:
     recalled = IdentifiedVehicle(PX4, 0.002, 0.0)
     learner = Learner(FILE, IdentifySettings(online=False), known=recalled)
     assert not learner.wants_excitation

@@ -54,7 +54,7 @@ def hovering(noise: Noise | None = None, until_s: float = 5.0) -> Observer:
 # ---------------------------------------------------------------- gains and motion
 
 
-def test_steady_gains_are_those_of_the_riccati_equation() -> None:
+def test_steady_gains_solve_the_riccati_equation() -> None:
     """A message that is disturbed by 1e-6 changes the lateral state [p, v, b, b', d] by SciPy's
     gains times that. The velocity, with an sd of 1 m/s, has no influence."""
     small, step_s, noise = 1e-6, 0.01, Noise(velocity_sd_mps=1.0)
@@ -91,7 +91,7 @@ def test_steady_gains_are_those_of_the_riccati_equation() -> None:
 
 
 @pytest.mark.parametrize("damping", [0.56, 1.115])
-def test_replay_agrees_with_scipy(damping: float) -> None:
+def test_propagation_agrees_with_scipy(damping: float) -> None:
     """The oracle for one second under five commands, each axis with its own delay, is DOP853,
     restarted whenever a command takes effect."""
     tilt = PX4.tilt.model_copy(update={"damping": damping})
@@ -175,7 +175,7 @@ def test_prediction_is_exact_on_a_matching_plant() -> None:
     compare(observer.predict(plant.time_s - PX4.tilt.delay_s), 4e-4)
 
 
-def test_vertical_is_predicted_to_the_time_when_the_thrust_acts() -> None:
+def test_vertical_state_is_predicted_to_when_the_thrust_acts() -> None:
     """A descent at 2 m/s, delays 15 ms (thrust) and 57 ms (tilt), gives two times and heights."""
     observer, thrust = Observer(PX4), G - 1.02 * 2.0
     observer.on_command(0.0, command(0.0, 0.0, thrust))
@@ -195,7 +195,7 @@ def test_vertical_is_predicted_to_the_time_when_the_thrust_acts() -> None:
 
 
 @pytest.mark.parametrize(("gap_s", "velocity_sd_mps"), [(0.01, 1.0), (0.05, 0.005)])
-def test_disturbance_and_velocity_converge_at_any_rate(
+def test_disturbance_and_velocity_converge_at_100_and_20_hz(
     gap_s: float, velocity_sd_mps: float
 ) -> None:
     """The reported velocity has a bias of up to 0.3 m/s."""
@@ -238,7 +238,7 @@ def test_hover_thrust_is_estimated_from_the_disturbance() -> None:
     assert abs(state.velocity_ned_mps[2]) < 0.01
 
 
-def test_observer_goes_on_smoothly_with_another_drag() -> None:
+def test_changed_drag_moves_into_the_disturbance() -> None:
     """The disturbance changes with the drag, so that the predicted acceleration stays the same."""
     observer = Observer(PX4)
     for i in range(300):
@@ -254,7 +254,7 @@ def test_observer_goes_on_smoothly_with_another_drag() -> None:
 # ---------------------------------------------------------------- ground, gaps, jumps
 
 
-def test_prediction_reaches_to_its_time_on_a_link_that_is_2_s_late() -> None:
+def test_prediction_spans_a_link_delay_of_2_s() -> None:
     """A level vehicle that moves at 1 m/s is slowed by its drag alone."""
     observer, drag_ps, ahead_s = Observer(PX4), PX4.drag_per_mass_ps, 2.5
     observer.on_command(0.0, LEVEL)
@@ -307,7 +307,7 @@ def test_position_older_than_the_attitude_is_used_at_its_own_time() -> None:
     assert state.velocity_ned_mps[0] == pytest.approx(3.0, abs=5e-3)
 
 
-def test_a_jump_is_followed_without_a_velocity_kick() -> None:
+def test_position_jump_causes_no_velocity_kick() -> None:
     """After a jump the next position has little effect on the velocity, because the jump says
     nothing about it. A jump of the reported velocity becomes bias."""
     kicks = []
@@ -326,7 +326,7 @@ def test_a_jump_is_followed_without_a_velocity_kick() -> None:
         assert observer.predict(time_s).velocity_ned_mps == pytest.approx([0, 0, 0], abs=0.01)
 
 
-def test_restart_after_a_long_gap_keeps_the_disturbance_and_after_a_reboot_the_clock() -> None:
+def test_observer_restarts_after_a_gap_and_after_a_reboot() -> None:
     observer = Observer(NO_DELAY)
     observer.on_command(0.0, LEVEL)
     assert not observer.ready
@@ -443,7 +443,7 @@ def test_white_noise_is_measured_and_filtered(gap_s: float) -> None:
         assert rms(adapted - flown.positions) < 0.006
 
 
-def test_estimate_that_wanders_is_neither_noise_nor_gusts() -> None:
+def test_wandering_estimate_counts_as_neither_noise_nor_gusts() -> None:
     """The velocity walks as that of PX4's estimate (0.2 m/s per root second) and is smooth from
     sample to sample. No noise of the position is found; a third of the variance of the walk,
     0.0103 m/s, is taken for noise of the velocity. Two seeds."""
@@ -455,7 +455,7 @@ def test_estimate_that_wanders_is_neither_noise_nor_gusts() -> None:
         assert observer.estimated.drift_mps2 == pytest.approx([floor, floor], rel=0.3)
 
 
-def test_gusts_are_followed_faster() -> None:
+def test_adaptive_observer_follows_gusts_faster() -> None:
     """While the disturbance drifts by 0.7 m/s^2 per root second, both estimated densities grow, the
     vertical one only once the thrust is identified; afterwards they fall. The error of the
     disturbance is less than 0.7 of the error with the configured density."""
@@ -481,7 +481,7 @@ def test_jumps_are_not_noise_and_do_not_hide_gusts() -> None:
     assert observer.estimated.drift_mps2[0] > 0.5
 
 
-def test_estimates_are_bounded_and_cleared_by_a_reset() -> None:
+def test_noise_estimates_are_bounded_and_cleared_by_a_reset() -> None:
     noise = replace(NOISE, disturbance_limit_mps2=0.4)
     observer, _, _ = observe(hover(15.0, 0.01, seed=10, drift=2.0), noise, (0.05, 0.0))
     assert noise_sds(observer)[0] > 0.03
@@ -491,7 +491,7 @@ def test_estimates_are_bounded_and_cleared_by_a_reset() -> None:
     assert observer.estimated.drift_mps2 == pytest.approx([0.15, 0.15])
 
 
-def test_positions_that_an_attitude_has_overtaken_leave_the_noise_finite() -> None:
+def test_positions_older_than_the_attitude_keep_the_noise_finite() -> None:
     """Two positions arrive after a newer attitude, so that the state has the same time at both."""
     observer = Observer(NO_DELAY, NOISE)
     observer.on_command(0.0, LEVEL)

@@ -79,7 +79,7 @@ def tilted(heading: float) -> tuple[PredictedState, Straight]:
     return state, Straight(turn.apply([1.5, -1.0, 0.2]), velocity, float(goal_rad))
 
 
-def test_the_heading_frame_is_eq_5_at_heading_north() -> None:
+def test_heading_frame_equals_eq_5_at_heading_north() -> None:
     state, reference = tilted(0.0)
     vector, target = heading_frame(state, reference.sample(0.1))
     expected = [0.08, -0.05, -0.1, 0.1, -0.2, 0.05, 0.8, 0.3, -0.2]
@@ -92,7 +92,7 @@ SUMMED = IntegralSettings(weights=(80.0, 80.0, 15.0, 50.0))
 
 
 @pytest.mark.parametrize("settings", [PaperSettings(), PaperSettings(integral=SUMMED)])
-def test_the_law_is_the_same_at_every_heading(settings: PaperSettings) -> None:
+def test_paper_law_is_independent_of_the_heading(settings: PaperSettings) -> None:
     """The second heading is near the wrap; three decisions let an integral term accumulate."""
     controller, heading = PaperController(PAPER, settings), 3.1
     commands = []
@@ -111,7 +111,7 @@ def test_the_law_is_the_same_at_every_heading(settings: PaperSettings) -> None:
     assert abs(turned.heading_rad) <= np.pi
 
 
-def test_what_is_sent_is_the_attitude_of_the_next_state() -> None:
+def test_command_is_the_attitude_of_the_next_state() -> None:
     """The oracle is the paper's sampled plant with the inputs that the law decides there."""
     state, reference = tilted(0.4)
     command = PaperController(PAPER).decide(Situation(0.0, state, reference, HOVER)).command
@@ -128,7 +128,7 @@ def test_what_is_sent_is_the_attitude_of_the_next_state() -> None:
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=VEHICLES.keys())
-def test_an_input_accelerates_every_vehicle_as_it_does_the_papers(vehicle: Vehicle) -> None:
+def test_inputs_accelerate_every_vehicle_like_the_papers(vehicle: Vehicle) -> None:
     _, theirs = hover_matrices(PAPER)
     _, ours = hover_matrices(vehicle)
     assert ours * input_scale(vehicle) == pytest.approx(theirs, abs=1e-12)
@@ -141,7 +141,7 @@ def test_an_input_accelerates_every_vehicle_as_it_does_the_papers(vehicle: Vehic
     assert upper[0] <= 3.942
 
 
-def test_rates_that_are_not_finite_and_a_cost_that_overflows_give_no_decision() -> None:
+def test_non_finite_rates_or_costs_raise_decision_error() -> None:
     state, reference = tilted(0.3)
     for field, value, reason in (
         ("rates_frd_radps", np.nan, "predicted state"),
@@ -152,7 +152,7 @@ def test_rates_that_are_not_finite_and_a_cost_that_overflows_give_no_decision() 
             PaperController(PAPER).decide(Situation(0.0, spoilt, reference, HOVER))
 
 
-def test_the_summed_error_has_limits_and_waits_while_an_input_is_at_its_bound() -> None:
+def test_error_sum_is_limited_and_held_at_input_bounds() -> None:
     """The sum acts on the gradient of the cost; at its limits more error changes nothing."""
     narrow = SUMMED.model_copy(update={"limits": (0.1, 0.1, 0.1, 0.1)})
 

@@ -60,7 +60,7 @@ def mean_spread(flights: list[Flight]) -> float:
 # ---------------------------------------------------------------- the law and its model
 
 
-def test_the_cost_is_eq_21() -> None:
+def test_cost_agrees_with_eq_21() -> None:
     """The quadratic that the swarm gets equals Eq. 21 as printed; a reset forgets u(k-1)."""
     a, b = paper_model()
     rng = np.random.default_rng(1)
@@ -82,7 +82,7 @@ def test_the_cost_is_eq_21() -> None:
                 assert float(problem(u)) == pytest.approx(eq_21(u) - lost, rel=1e-10)
 
 
-def test_the_cost_to_go_makes_one_step_the_lqr() -> None:
+def test_one_step_with_cost_to_go_is_the_lqr() -> None:
     a, b = paper_model()
     gain, _, poles = control.dlqr(a, b, Q, R)
     free = FINAL.model_copy(update={"rate": (0,) * 4, "lower": (-1e3,) * 4, "upper": (1e3,) * 4})
@@ -96,7 +96,7 @@ def test_the_cost_to_go_makes_one_step_the_lqr() -> None:
     np.testing.assert_allclose(np.abs(found)[:12], np.sort(np.abs(poles))[::-1], rtol=1e-6)
 
 
-def test_time_constant_by_horizon() -> None:
+def test_longer_horizons_shorten_the_time_constant() -> None:
     """The poles of 300 steps are those of the infinite horizon."""
     for steps, time_constant_s in ((1, 39.16), (5, 5.46), (10, 1.69), (20, 1.07)):
         slowest = abs(receding(*paper_model(), Q, R, RATE, steps)[0])
@@ -117,7 +117,7 @@ def test_cost_to_go_settles_a_hundred_times_closer(plant: PlantKind) -> None:
     assert best < 0.01 * one
 
 
-def test_both_plants_settle_alike_in_wind_and_with_weak_thrust() -> None:
+def test_linear_and_nonlinear_plants_settle_alike() -> None:
     """A level vehicle reaches the wind's velocity; with 10 % less thrust it sinks by its drag."""
     vehicle = paper_vehicle()
     sink = 0.1 * vehicle.mass_kg * vehicle.gravity_mps2 / vehicle.drag_translation_npmps[2]
@@ -134,7 +134,7 @@ def test_both_plants_settle_alike_in_wind_and_with_weak_thrust() -> None:
 # ---------------------------------------------------------------- the printed tables
 
 
-def test_damping_quietens_the_signals_and_epsilon_undamped_is_the_papers() -> None:
+def test_undamped_epsilon_matches_paper_and_damping_halves_costs() -> None:
     loud, quiet = flown(1.0), flown(0.65)
     assert 0.9 < mean_spread(loud) < 1.7  # printed 1.3944
     assert min(flight.spreads.min() for flight in loud) > 0.5  # printed 0.9380
@@ -144,13 +144,13 @@ def test_damping_quietens_the_signals_and_epsilon_undamped_is_the_papers() -> No
 
 
 @pytest.mark.slow
-def test_damped_epsilon_is_the_papers_only_with_the_constant_term() -> None:
+def test_damped_epsilon_matches_the_paper_only_with_the_constant_term() -> None:
     kept, dropped = mean_spread(flown(0.65)), mean_spread(flown(0.65, keep_constant=False))
     assert 2.77e-9 < kept < 2.77e-7  # printed 2.7744e-08
     assert dropped < 0.03 * kept
 
 
-def test_the_exact_optimum_is_met_at_the_best_damping_and_missed_beside_it() -> None:
+def test_swarm_reaches_the_optimum_only_at_the_best_damping() -> None:
     missed = {
         d: float(np.mean([flight.gaps > 1e-6 for flight in flown(d)])) for d in (0.3, 0.65, 1.0)
     }
@@ -161,7 +161,7 @@ def test_the_exact_optimum_is_met_at_the_best_damping_and_missed_beside_it() -> 
     assert mean_spread(flown(0.3)) < 1e-2 * mean_spread(flown(0.65))  # small, but it is missed
 
 
-def test_reweighting_takes_nearly_all_of_the_error() -> None:
+def test_reweighting_removes_95_percent_of_the_error() -> None:
     before = np.mean([flight.errors[-1] for flight in flown(0.65)])
     after = np.mean([flight.errors[-1] for flight in FLIGHTS.by_seed(FINAL)])
     assert after < 0.05 * before  # printed ratio 0.0163
@@ -181,7 +181,7 @@ def test_integral_removes_the_steady_error() -> None:
 
 
 @pytest.mark.slow
-def test_limits_hold_in_every_sample_of_the_path() -> None:
+def test_state_limits_hold_in_every_sample_of_the_path() -> None:
     for row in extensions.limits_table(FLIGHTS).rows:
         if row["law"] == "limited":
             assert row["greatest"] <= row["limit"] * (1 + 1e-9), row
@@ -190,7 +190,7 @@ def test_limits_hold_in_every_sample_of_the_path() -> None:
             assert row["greatest"] > (1.2 if free else 0.8) * row["limit"], row
 
 
-def test_a_vehicle_outside_its_limits_comes_back_and_stays_within_whatever_is_done() -> None:
+def test_vehicle_returns_within_its_state_limits_and_stays() -> None:
     """The vehicle begins at twice its speed limit and brakes. Then its inputs are a random corner
     of the narrowed box, drawn every 7 steps, up to 3000 steps."""
     dynamics, inputs = paper_model()
@@ -210,7 +210,7 @@ def test_a_vehicle_outside_its_limits_comes_back_and_stays_within_whatever_is_do
         assert greatest[index] > 0.9 * limit
 
 
-def test_the_certificate_is_of_the_narrowed_box() -> None:
+def test_certificate_holds_for_the_narrowed_box() -> None:
     settings = PaperSettings(limits=TIGHT)
     law = PaperLaw(*paper_model(), settings)
     target = np.zeros(12)
@@ -255,7 +255,7 @@ DRAWN = """[...document.querySelectorAll('.figure')].map(f => [f.id.replace('fig
 
 
 @pytest.mark.slow
-def test_the_page_opens_without_a_network_and_shows_everything(run: Run) -> None:
+def test_study_page_opens_offline_and_shows_everything(run: Run) -> None:
     out, made = run
     assert set(made) == set(MAKERS)
     with opening(out / PAGE) as opened:
@@ -281,7 +281,7 @@ def test_the_page_opens_without_a_network_and_shows_everything(run: Run) -> None
         assert count == len(table.rows)
 
 
-def test_bad_options_are_one_sentence(tmp_path: Path) -> None:
+def test_unknown_figure_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="there is no figure '3'; known are 4, 5"):
         reproduce(tmp_path / "never", ["figure 3"], 1, Console(file=io.StringIO()))
     assert not (tmp_path / "never").exists()

@@ -43,7 +43,7 @@ def state_of(track: Track, time_s: float | Array) -> FlatState:
 
 
 @pytest.mark.parametrize("flown", TRACKS)
-def test_thrust_along_b_flies_the_trajectory(flown: Track) -> None:
+def test_flat_thrust_reproduces_the_trajectory(flown: Track) -> None:
     def dynamics(time_s: float, state: Array) -> Array:
         flat = state_of(flown, time_s)
         thrust = float(flat.thrust_mps2) * flat.thrust_direction_ned
@@ -61,7 +61,7 @@ def test_thrust_along_b_flies_the_trajectory(flown: Track) -> None:
 
 
 @pytest.mark.parametrize("flown", TRACKS)
-def test_rates_turn_the_attitude(flown: Track) -> None:
+def test_body_rates_agree_with_the_attitude(flown: Track) -> None:
     """Body rates agree with SciPy's rotation vector from one attitude to the next, b with its z
     axis, and the rate of the thrust with a central difference."""
     times = np.linspace(0.1, flown.duration_s - 0.1, 400)
@@ -108,7 +108,7 @@ def vehicle(**changes: object) -> Vehicle:
     return Vehicle.model_validate(values | changes)
 
 
-def test_a_circle_by_hand() -> None:
+def test_circle_agrees_with_closed_forms() -> None:
     """Tilt, height and distance are closed forms; a circle beyond a limit is refused."""
     inward = (2 * math.pi / 8) ** 2 * 2.0
     flown = track(shape="circle", radius_m=2.0, period_s=8.0, run_in_s=30, run_out_s=30)
@@ -150,7 +150,7 @@ UP = {"shape": "line", "to_north_m": 0, "speed_mps": 10, "run_out_s": 6, "height
         (UP | {"climb_m": -60, "run_in_s": 2.2}, "a thrust of", "3.27 m/s^2"),
     ],
 )
-def test_refused_with_time_value_and_limit(
+def test_infeasible_reference_is_refused_with_time_value_and_limit(
     settings: dict[str, object], what: str, limit: str
 ) -> None:
     flown = track(**settings)
@@ -186,17 +186,17 @@ class Leap:
         (-15.0, r"a speed of 20 m/s at 10.00 s, .* \(first at 6.0[01] s"),
     ],
 )
-def test_the_limit_that_is_met_first_is_named(start_down_m: float, sentence: str) -> None:
+def test_first_exceeded_limit_is_named(start_down_m: float, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         check(Leap(start_down_m), vehicle())
 
 
-def test_what_is_not_a_number_is_refused() -> None:
+def test_nan_height_is_refused() -> None:
     with pytest.raises(ValueError, match="a height of nan m"):
         check(hold((0.0, 0.0, math.nan), 0.0), vehicle())
 
 
-def test_long_references_are_checked_in_parts() -> None:
+def test_long_references_are_checked_to_their_end() -> None:
     """The line is gentle for 500 s and has its greatest values, or a sudden stop, at its end."""
     climb = {"shape": "line", "to_north_m": 30, "climb_m": 96, "speed_mps": 0.2, "height_m": 2.0}
     assert check(track(**climb), vehicle())[1:] == pytest.approx((98.0, 30.0))

@@ -55,7 +55,7 @@ def orders(sample: FlatSample) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("track", TRACKS.values(), ids=TRACKS.keys())
-def test_derivatives_rest_and_arrays_of_every_track(track: Track) -> None:
+def test_tracks_have_consistent_derivatives_and_begin_and_end_at_rest(track: Track) -> None:
     """Each derivative is the central difference of the order below and has no jump, the track is at
     rest before and after, and arrays give the same as loops."""
     drawn = np.random.default_rng(3).uniform(0.12, track.duration_s - 0.12, 60)
@@ -84,7 +84,7 @@ def test_derivatives_rest_and_arrays_of_every_track(track: Track) -> None:
     assert track.path_time_s(middle_s) == pytest.approx(middle_s - 0.5 * track.run_in_s)
 
 
-def test_a_paused_reference_rests_on_its_path_and_continues_from_there() -> None:
+def test_paused_reference_rests_on_its_path_and_resumes() -> None:
     began_s, paused_s, resumed_s = 100.0, 108.3, 115.0
     track = shipped_track("lemniscate_course")
     paused = Moved(track, began_s, (10.0, -5.0, 2.0), paused_s).resumed(resumed_s)
@@ -131,7 +131,7 @@ def test_shipped_references_are_feasible_and_have_their_peak_speeds() -> None:
             assert speed_mps == pytest.approx(peaks_mps[name], rel=0.005)
 
 
-def test_published_curves_are_as_their_definitions() -> None:
+def test_shipped_curves_match_their_published_formulas() -> None:
     """Curves of quad_trajectories and ours, as north, east and height by time at full speed."""
     s = np.linspace(3.0, 50.0, 400)
     trefoil, w = shipped_track("trefoil"), math.tau * s / 25.0
@@ -152,7 +152,7 @@ def test_published_curves_are_as_their_definitions() -> None:
         np.testing.assert_allclose(flown_m[inside], expected_m[inside], atol=0.001)
 
 
-def test_heading_along_velocity_points_along_it_and_unwraps() -> None:
+def test_heading_along_velocity_is_tangential_and_unwrapped() -> None:
     track = track_of("circle", "along_velocity", laps=3)
     times = np.linspace(0.0, track.duration_s, 2301)
     sample = track.sample(times)
@@ -192,7 +192,7 @@ def test_a_path_without_horizontal_motion_keeps_its_heading() -> None:
 
 
 @pytest.mark.parametrize(("minimise", "order"), [("jerk", 3), ("snap", 4)])
-def test_waypoints_minimise_what_they_say(minimise: str, order: int) -> None:
+def test_waypoint_paths_minimise_jerk_or_snap(minimise: str, order: int) -> None:
     """The first variation of the integral vanishes for an admissible bump (zero at the points, flat
     at the ends); the second is positive by itself."""
     times = np.array([0.0, 3.0, 5.5, 8.0, 12.0])
@@ -232,7 +232,7 @@ def test_waypoints_minimise_what_they_say(minimise: str, order: int) -> None:
         ),
     ],
 )
-def test_what_cannot_be_flown_is_refused(settings: dict[str, object], sentence: str) -> None:
+def test_invalid_reference_settings_are_refused(settings: dict[str, object], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         SHAPES[str(settings["shape"])](**settings).track()
 
@@ -267,7 +267,7 @@ def shares(path: Spline) -> tuple[float, float, float, float]:
 
 
 @pytest.mark.parametrize("smoothness", [Smoothness.SNAP, Smoothness.JERK])
-def test_the_fastest_path_keeps_its_limits_and_no_leg_can_be_shorter(
+def test_fastest_path_keeps_its_limits_and_cannot_be_shortened(
     smoothness: Smoothness,
 ) -> None:
     times_s = fastest_times(CORNERS, smoothness, LIMITS)

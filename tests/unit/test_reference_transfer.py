@@ -28,7 +28,7 @@ def peaks(flown: Track) -> tuple[float, float, float]:
 
 
 @pytest.mark.parametrize("distance_m", [0.0, 0.2, 3.0, 10.0])
-def test_as_fast_as_the_limits_allow(distance_m: float) -> None:
+def test_transfer_is_as_fast_as_the_limits_allow(distance_m: float) -> None:
     limits = Limits(speed_mps=2.0, acceleration_mps2=1.5, heading_rate_radps=0.5)
     flown = transfer((0, 0, -3), (distance_m, 0, -3), 0.0, 1.0, limits)
     speed, acceleration, rate = peaks(flown)
@@ -36,7 +36,7 @@ def test_as_fast_as_the_limits_allow(distance_m: float) -> None:
     assert 0.85 < ratio <= 1.001
 
 
-def test_any_start_is_braked_and_the_way_flown_within_the_limits() -> None:
+def test_transfer_from_any_velocity_stays_within_the_limits() -> None:
     """From any start velocity the transfer has no kink, ends at rest at the target and goes no
     further out than braking needs. It lasts no longer than a transfer at constant acceleration with
     twice the time to gain and lose speed. A long way is flown at constant speed."""
@@ -78,7 +78,7 @@ def table_track(text: str, **settings: object) -> Track:
     return FromTable(**{"file": "flown.csv", "text": text} | settings).track()
 
 
-def test_passes_through_every_row_with_its_heading() -> None:
+def test_table_track_passes_through_every_row_with_its_heading() -> None:
     """Columns may have any order and any of their names, times any start and unequal steps."""
     times = np.delete(np.linspace(0, 12, 25), 7)
     heading = (300 + 15 * times) % 360
@@ -102,7 +102,7 @@ def test_passes_through_every_row_with_its_heading() -> None:
     )
 
 
-def test_knots_forgive_rounded_rows() -> None:
+def test_knot_fit_smooths_rounded_rows() -> None:
     """Rows at 100 Hz rounded to a millimetre cannot be flown interpolated, but fitted they can."""
     times = np.arange(0, 10, 0.01)
     rows = "".join(

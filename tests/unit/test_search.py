@@ -89,7 +89,7 @@ def whole_search(tmp_path_factory: pytest.TempPathFactory) -> tuple[Campaign, li
     return searched(tmp_path_factory.mktemp("search") / "whole")
 
 
-def test_failures_that_differ_are_found_and_reduced_to_their_causes(
+def test_search_reduces_failures_to_their_causes(
     whole_search: tuple[Campaign, list[Failure]],
 ) -> None:
     campaign, failures = whole_search
@@ -104,7 +104,7 @@ def test_failures_that_differ_are_found_and_reduced_to_their_causes(
     assert shown.count(f"{BANDWIDTH}=") < 100  # of the worst flights alone, not of 200 groups
 
 
-def test_values_that_cannot_be_flown_are_no_failures(
+def test_infeasible_values_do_not_count_as_failures(
     whole_search: tuple[Campaign, list[Failure]], tmp_path: Path
 ) -> None:
     """A third of the bandwidth's range cannot be flown; failures elsewhere are found as before."""
@@ -118,7 +118,7 @@ def test_values_that_cannot_be_flown_are_no_failures(
     assert {one.kind for one in failures} == {one.kind for one in whole_search[1]}
 
 
-def test_an_interrupted_search_goes_on_and_finds_the_same(
+def test_interrupted_search_resumes_with_the_same_result(
     whole_search: tuple[Campaign, list[Failure]], tmp_path: Path
 ) -> None:
     whole, failures = whole_search
@@ -130,7 +130,7 @@ def test_an_interrupted_search_goes_on_and_finds_the_same(
     assert tables[0] == tables[1]
 
 
-def test_a_search_without_its_package_flies_nothing(
+def test_search_without_optuna_flies_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "optuna", None)
@@ -176,7 +176,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tuned, Path]:
     return tuned(directory), directory / "tune.yaml"
 
 
-def test_the_minimum_is_found_and_confirmed_and_its_profile_is_a_configuration(
+def test_tuning_confirms_the_minimum_and_writes_a_profile(
     whole: tuple[Tuned, Path], tmp_path: Path
 ) -> None:
     found, tuning = whole
@@ -192,7 +192,7 @@ def test_the_minimum_is_found_and_confirmed_and_its_profile_is_a_configuration(
         assert config[part] == shipped[part]
 
 
-def test_an_interrupted_tuning_goes_on_and_finds_the_same(
+def test_interrupted_tuning_resumes_with_the_same_result(
     whole: tuple[Tuned, Path], tmp_path: Path
 ) -> None:
     """A trial is four flights; the first trial has the present values, interrupted or not."""
@@ -207,7 +207,7 @@ def test_an_interrupted_tuning_goes_on_and_finds_the_same(
     assert found == whole[0]
 
 
-def test_a_file_that_cannot_be_tuned_is_refused(tmp_path: Path) -> None:
+def test_invalid_tuning_file_is_refused(tmp_path: Path) -> None:
     for change, sentence in (
         (("[gusts, noise]", "[calm, noise]"), "2 flights are in training and in validation"),
         (("feedback_limit", "feedback"), "ranges.controller.feedback is no number"),
@@ -218,7 +218,7 @@ def test_a_file_that_cannot_be_tuned_is_refused(tmp_path: Path) -> None:
             tuned(tmp_path / "t", TUNE.replace(*change))
 
 
-def test_a_verdict_needs_a_difference_that_is_no_chance() -> None:
+def test_tuning_verdict_needs_a_significant_difference() -> None:
     random = np.random.default_rng(3)
     base = random.uniform(0.02, 0.2, 20)
     noise = random.normal(0.0, 0.01, 20)

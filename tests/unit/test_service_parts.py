@@ -54,7 +54,7 @@ def recorded(directory: Path) -> tuple[Recorder, list[Path]]:
 
 
 @pytest.mark.parametrize("version_1", [False, True])
-def test_a_flight_log_begins_with_what_came_before(
+def test_flight_log_begins_with_the_last_five_seconds(
     version_1: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The log begins with the old home position, the last five seconds and the configuration."""
@@ -92,7 +92,9 @@ def test_a_flight_log_begins_with_what_came_before(
 
 
 @pytest.mark.parametrize(("age_s", "left"), [(0, "px4-1-7"), (700, ""), (-4000, "px4-1-7")])
-def test_what_a_killed_service_has_not_done(tmp_path: Path, age_s: int, left: str) -> None:
+def test_next_service_finds_the_unscored_flight_and_engaged_vehicle(
+    tmp_path: Path, age_s: int, left: str
+) -> None:
     """The next service lists the flight, and knows the engaged vehicle for ten minutes. A log with
     a stamp in the future counts: this computer has booted, and its clock is not set yet."""
     killed, _ = recorded(tmp_path)
@@ -108,7 +110,7 @@ def test_what_a_killed_service_has_not_done(tmp_path: Path, age_s: int, left: st
     assert not (cut / "engaged").exists()
 
 
-def test_a_vehicle_is_left_engaged_until_it_was_handed_back(tmp_path: Path) -> None:
+def test_vehicle_counts_as_engaged_until_hand_back(tmp_path: Path) -> None:
     recorder, scored = recorded(tmp_path)
     flights = []
     for engaged in (True, False, False, True):
@@ -138,7 +140,7 @@ def test_the_rolling_log_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert sum(sizes) > 10_000
 
 
-def test_a_flight_that_cannot_be_recorded_says_so_and_the_next_one_is(
+def test_recorder_reports_a_write_error_and_records_the_next_flight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(clock, "local_stamp", iter([f"{ROLLING_NAMES[0]}/x", "later"]).__next__)
@@ -157,7 +159,7 @@ def test_a_flight_that_cannot_be_recorded_says_so_and_the_next_one_is(
     assert scored == [tmp_path / "later"]
 
 
-def test_an_identified_vehicle_is_kept_and_used_for_the_same_file_alone(tmp_path: Path) -> None:
+def test_stored_vehicle_is_used_only_with_the_same_file(tmp_path: Path) -> None:
     known = build(load("flight", choices={"vehicle": "px4_sih"}))
     found = known.config.vehicle.model_copy(update={"hover_thrust": 0.51})
     identified = IdentifiedVehicle(found, 0.002, 0.008, 0.04)
@@ -179,7 +181,7 @@ def test_an_identified_vehicle_is_kept_and_used_for_the_same_file_alone(tmp_path
     assert not (tmp_path / "vehicles" / "px4-1-1.yaml").exists()
 
 
-def test_the_lock_names_its_holder_and_dies_with_it(tmp_path: Path) -> None:
+def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
     """The holder runs as a systemd unit does and, if possible, as another user."""
     code = (
         "import os, sys\n"
@@ -210,7 +212,9 @@ def test_the_lock_names_its_holder_and_dies_with_it(tmp_path: Path) -> None:
         directory_lock(tmp_path / "new").__enter__()
 
 
-def test_a_full_disk_is_no_wrong_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_is_told_apart_from_a_wrong_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(*_: object) -> int:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -222,7 +226,7 @@ def test_a_full_disk_is_no_wrong_option(tmp_path: Path, monkeypatch: pytest.Monk
     assert [disk_is_full(each.value) for each in (wrong, passing)] == [False, True]
 
 
-def test_what_the_user_of_the_unit_cannot_read(
+def test_daemon_explains_why_its_unit_cannot_read_a_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "home" / "my.yaml"
@@ -235,7 +239,7 @@ def test_what_the_user_of_the_unit_cannot_read(
     assert daemon.unreadable(Path("/etc/passwd")) == ""
 
 
-def test_the_link_is_opened_when_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_daemon_retries_a_port_in_use(monkeypatch: pytest.MonkeyPatch) -> None:
     """A port in use is reported once and tried until it is free. A wrong address is an error."""
     monkeypatch.setattr(daemon, "LINK_EVERY_S", 0.01)
     holder = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -262,7 +266,7 @@ def test_the_link_is_opened_when_it_can_be(monkeypatch: pytest.MonkeyPatch) -> N
                 daemon.opened(wrong, stops, told.append, Watching())
 
 
-def test_the_service_manager_is_told_and_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_systemd_notifications_do_not_block(monkeypatch: pytest.MonkeyPatch) -> None:
     """The manager reads nothing until its queue is full; a dropped message is sent again."""
     name = f"offboard-{os.getpid()}"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
@@ -281,7 +285,7 @@ def test_the_service_manager_is_told_and_not_waited_for(monkeypatch: pytest.Monk
         assert systemd.recv(100) == b"READY=1\nWATCHDOG=1\nSTATUS=1000"
 
 
-def test_a_changed_configuration_is_used_and_a_bad_one_refused(
+def test_changed_configuration_is_used_and_a_bad_one_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(preparation, "rehearse", lambda parts, keeps_deadline: None)
@@ -311,7 +315,7 @@ def test_a_changed_configuration_is_used_and_a_bad_one_refused(
     assert "height_m: 3" in watched.newest.text
 
 
-def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
+def test_pilot_switch_engages_only_in_the_air_without_failsafe() -> None:
     switch = PilotSwitch.FOUND
 
     def shows(
@@ -341,7 +345,7 @@ def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
     assert switch is PilotSwitch.TOO_SOON
 
 
-def test_a_reference_that_is_placed_low_stays_clear_of_the_ground() -> None:
+def test_low_reference_is_raised_clear_of_the_ground() -> None:
     """The reference is a helix that descends by 4 m."""
     config = load(
         "flight",
@@ -360,7 +364,7 @@ def test_a_reference_that_is_placed_low_stays_clear_of_the_ground() -> None:
     assert plan.place_start((3.0, 4.0, -20.0), REST, None) == pytest.approx(falls_m, abs=0.02)
 
 
-def test_a_pause_that_is_continued_and_paused_again_while_it_stops_is_one_pause() -> None:
+def test_repeated_pauses_while_stopping_count_as_one() -> None:
     """Each such pair once made every later sample slower, until one raised RecursionError."""
     config = load("flight", choices={"reference": "lemniscate", "vehicle": "px4_sih"})
     plan = FlightPlan(build(config).track)
@@ -377,7 +381,7 @@ def test_a_pause_that_is_continued_and_paused_again_while_it_stops_is_one_pause(
 
 
 @pytest.mark.parametrize("speed_mps", [0.3, 4.0])
-def test_a_moving_vehicle_is_stopped_where_the_reference_starts(speed_mps: float) -> None:
+def test_reference_starts_where_a_moving_vehicle_stops(speed_mps: float) -> None:
     """The reference does not lead back. A smooth stop with at most 2 m/s^2 needs 35/32 of the way
     of a stop at a constant 1 m/s^2."""
     config = load("flight", choices={"reference": "hover", "vehicle": "px4_sih"})

@@ -56,7 +56,7 @@ MANY = {"particles": 200, "iterations": 300, "damping": 0.8}
         (rastrigin, [0.6, -5], [4, 4], [0.9949586, 0], MANY, 1e-5),  # global minimum outside
     ],
 )
-def test_known_minima_are_found(
+def test_swarm_finds_known_minima(
     objective: Callable[[Array], Array], lower: list[float], upper: list[float],
     minimiser: list[float], settings: dict[str, float], tolerance: float,
 ) -> None:  # fmt: skip
@@ -90,14 +90,14 @@ def furthest_misses(settings: SwarmSettings, searches: int) -> Array:
     return misses
 
 
-def test_no_search_of_500_is_a_thousandth_of_the_range_off_the_closed_form() -> None:
+def test_500_searches_agree_with_the_closed_form() -> None:
     """Without rebound some searches miss a minimum on the bounds."""
     assert furthest_misses(SwarmSettings(iterations=60), 500).max() < 1e-3
     misses = furthest_misses(SwarmSettings(rebound=0.0), 500)
     assert 1 < np.sum(misses > 1e-3) < 25
 
 
-def test_seed_particles_bound_the_answer_and_are_put_inside_the_box() -> None:
+def test_seed_particles_are_evaluated_and_clipped_to_the_box() -> None:
     seeds, box = np.array([[0.3, -0.4], [9.0, 9.0]]), ([-1, -1], [1, 1])
     at_seed = search(lambda u: sphere(u - seeds[0]), *box, seeds, iterations=1)
     assert np.array_equal(at_seed.best, seeds[0])
@@ -106,7 +106,7 @@ def test_seed_particles_bound_the_answer_and_are_put_inside_the_box() -> None:
     assert np.array_equal(in_corner.best, np.ones(2))
 
 
-def test_costs_that_are_not_finite_never_win() -> None:
+def test_non_finite_costs_never_win() -> None:
     def holed(u: Array) -> Array:
         return np.where(u[:, 0] > 0, sphere(u - 0.5), np.array([np.nan, np.inf, -np.inf, 1e308])[
             np.arange(len(u)) % 4
@@ -119,7 +119,7 @@ def test_costs_that_are_not_finite_never_win() -> None:
     assert np.all(np.abs(hopeless.best) <= 1)
 
 
-def test_the_answer_comes_when_the_time_is_up() -> None:
+def test_search_ends_when_its_time_is_over() -> None:
     problem, minimiser = diagonal_problem(np.random.default_rng(10))
     left = iter([0.002, 0.001, 0.0])
     settings = SwarmSettings(iterations=1000)
@@ -132,13 +132,13 @@ def test_the_answer_comes_when_the_time_is_up() -> None:
         assert (whole.cut_short, whole.iterations) == (False, iterations)
 
 
-def test_bounds_that_make_no_box_are_refused() -> None:
+def test_invalid_bounds_are_refused() -> None:
     for lower, upper in (([1.0], [0.0]), ([0.0, 0.0], [1.0]), ([-np.inf], [0.0]), ([], [])):
         with pytest.raises(ValueError, match="bounds must be"):
             Swarm(SwarmSettings(), lower, upper, rng(0))
 
 
-def test_each_move_is_eq_30_then_eq_20_then_the_box() -> None:
+def test_particle_moves_follow_eqs_30_and_20_and_the_box() -> None:
     """The oracle, for ask/tell and compiled, is the equations in NumPy with the same random
     numbers. The spread (Eqs. 28-29) is the mean distance of the last positions from the best."""
     settings = SwarmSettings(social=1.4, rebound=0.25, inertia=1.9)
@@ -207,7 +207,7 @@ def answer(problem: BoxQuadratic, inputs: Array) -> SwarmResult:
     return SwarmResult(inputs, float(problem(inputs)), 0.25, 150, cut_short=True)
 
 
-def test_the_gap_is_how_much_more_the_answer_costs_than_the_minimum_of_all_active_sets() -> None:
+def test_gap_agrees_with_enumerated_active_sets() -> None:
     generator, exact, active = np.random.default_rng(1), ExactMinimum(4), set()
     for _ in range(150):
         problem = coupled_problem(generator, constant=1000.0)
@@ -229,7 +229,7 @@ def test_the_gap_is_how_much_more_the_answer_costs_than_the_minimum_of_all_activ
     assert active == {0, 1, 2, 3, 4}
 
 
-def test_the_gap_of_a_minimum_that_is_large_or_nothing() -> None:
+def test_gap_is_accurate_for_large_and_zero_minima() -> None:
     """An error of 1e-6 in each input costs 2e-12, which a float cannot show beside a J of 1e6."""
     large, none = (
         BoxQuadratic(np.eye(4), np.zeros(4), c, -np.ones(4), np.ones(4)) for c in (1e6, 0)
@@ -246,14 +246,14 @@ def test_the_gap_of_a_minimum_that_is_large_or_nothing() -> None:
     assert certify(flat, answer(flat, np.zeros(4))).gap == 0.0
 
 
-def test_an_input_that_cannot_move_is_not_at_its_bound() -> None:
+def test_fixed_input_does_not_count_as_at_its_bound() -> None:
     lower, upper = np.array([-1.0, 0.5, -1.0]), np.array([1.0, 0.5, 1.0])
     problem = BoxQuadratic(np.eye(3), np.zeros(3), 0.0, lower, upper)
     assert not at_bound(problem, np.array([0.0, 0.5, 0.999]))
     assert at_bound(problem, np.array([0.0, 0.5, 1.0]))
 
 
-def test_a_problem_that_is_not_finite_has_no_certificate_and_spoils_no_later_one() -> None:
+def test_non_finite_problem_gives_nan_without_later_errors() -> None:
     exact = ExactMinimum(4)
     sound = BoxQuadratic(np.eye(4), np.full(4, 0.5), 0.0, -np.ones(4), np.ones(4))
     spoilt = BoxQuadratic(np.full((4, 4), np.nan), np.zeros(4), 0.0, sound.lower, sound.upper)

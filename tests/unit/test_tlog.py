@@ -32,7 +32,7 @@ def recorded() -> tuple[bytes, tuple[tlog.LoggedMessage, ...], list[int]]:
 
 
 @pytest.mark.parametrize("path", [PX4, ARDUCOPTER])
-def test_the_layout_of_every_message_is_pymavlinks(path: Path) -> None:
+def test_message_layouts_agree_with_pymavlink(path: Path) -> None:
     """The first five messages of each name are compared, field by field."""
     seen: Counter[str] = Counter()
     for entry in tlog.read(path):
@@ -101,7 +101,7 @@ def test_damaged_entries_are_skipped_and_counted(
             assert told in log.damage
 
 
-def test_a_log_of_a_computer_without_a_clock_is_read(tmp_path: Path) -> None:
+def test_log_with_time_stamps_of_1970_is_read(tmp_path: Path) -> None:
     """Its time stamps begin in 1970, because of which its flights once could not be scored."""
     _, messages, _ = recorded()
     log = tmp_path / "1970.tlog"
@@ -110,7 +110,7 @@ def test_a_log_of_a_computer_without_a_clock_is_read(tmp_path: Path) -> None:
     assert [m.frame for m in tlog.read(log)] == [m.frame for m in messages]
 
 
-def test_a_story_is_told_in_vehicle_time() -> None:
+def test_texts_and_refusals_get_the_vehicle_time() -> None:
     """Every text and refusal has the time of the newest telemetry before it in the file. A text in
     chunks (STATUSTEXT.id) is complete once a chunk has fewer than 50 bytes."""
     flown = history.gather(tlog.read(PX4))

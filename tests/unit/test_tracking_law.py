@@ -24,7 +24,7 @@ from offboard.model.vehicle import DelayUncertainty, Vehicle
 from offboard.reference.base import Reference
 
 
-def test_gains_are_those_flown_on_px4() -> None:
+def test_lqr_gains_equal_those_flown_on_px4() -> None:
     for bandwidth, lateral, vertical in (
         (5.0, [-1.87, -0.667, 0.624, 0.041], [-18.5, -5.84, 0.26]),
         (7.0, [-3.20, -0.975, 0.901, 0.055], [-31.7, -8.23, 0.35]),
@@ -79,7 +79,7 @@ def test_unconstrained_minimiser_is_the_lqr_law() -> None:
 
 
 @pytest.mark.parametrize(("size", "least", "most"), [(0.01, 0, 0), (1, 20, 50), (10, 50, 50)])
-def test_bounds_hold_and_the_feedback_is_limited(size: float, least: int, most: int) -> None:
+def test_command_bounds_and_feedback_limit_hold(size: float, least: int, most: int) -> None:
     law, rng, reference = lqr(), np.random.default_rng(3), lemniscate(8.0)
     touched, limit = 0, math.sin(PX4.tilt_max_rad)
     for _ in range(50):
@@ -96,7 +96,7 @@ def test_bounds_hold_and_the_feedback_is_limited(size: float, least: int, most: 
     assert least <= touched <= most
 
 
-def test_heading_that_jumps_is_not_led_by_all_of_it() -> None:
+def test_heading_lead_is_limited() -> None:
     """The heading of noisy rows jumps. Without the limit on its acceleration the commanded heading
     was 80 degrees off, which saturates motors."""
     law, smooth = lqr(), lemniscate(15.0)
@@ -136,13 +136,13 @@ def test_swarm_finds_the_closed_form() -> None:
 # ---------------------------------------------------------------- flights
 
 
-def test_wind_and_a_wrong_hover_thrust_are_absorbed_with_position_at_thirty_hertz() -> None:
+def test_law_rejects_wind_and_wrong_hover_thrust_at_30_hz() -> None:
     """On a real PX4, whose estimate wanders, the RMSE was 0.032 to 0.037 m."""
     truth = Truth(PX4, thrust_scale=0.85, wind_force_ned_mps2=(2.04, 2.04, 0.0))
     assert fly(truth, lqr(), PX4, lemniscate(15.0), 23.0, gaps_s=(0.033,)) < 0.006
 
 
-def test_a_vehicle_that_leans_by_39_degrees_comes_to_rest() -> None:
+def test_vehicle_settles_while_leaning_39_degrees() -> None:
     """[Circle of 8 m/s at 42 degrees: the gain of hover gave a cycle of 0.05 m without noise.]"""
     storm, still = Truth(PX4, wind_force_ned_mps2=(7.9, 0.0, 0.0)), lemniscate(1e6)
     start = {"offset_ned_m": (0.5, 0.5, 0.0), "score_from_s": 14.0}
@@ -150,7 +150,7 @@ def test_a_vehicle_that_leans_by_39_degrees_comes_to_rest() -> None:
 
 
 @pytest.mark.parametrize(("vertical_m", "most_m"), [(0.0, 0.0002), (0.4, 0.0008)])
-def test_what_is_left_on_a_known_vehicle(vertical_m: float, most_m: float) -> None:
+def test_known_vehicle_is_tracked_within_a_millimetre(vertical_m: float, most_m: float) -> None:
     """All is known, without noise. A law that fights its own ripple leaves 0.8 and 1.5 mm."""
     reference = lemniscate(8.0, vertical_m=vertical_m)
     assert fly(Truth(PX4), lqr(), PX4, reference, 16.0) < most_m
@@ -187,7 +187,7 @@ def settled_rmse_m(truth: Vehicle, believed: Vehicle, bandwidth: float, **offset
 
 
 @pytest.mark.parametrize(("delay_s", "bandwidth"), [(0.057, 7.0), (0.17, 5.0)])
-def test_margin_divides_flights_that_settle_from_those_that_do_not(delay_s, bandwidth):
+def test_flights_settle_only_within_the_delay_margin(delay_s, bandwidth):
     believed, off = delayed(delay_s), (0.05, 0.05, 0.0)
     margin_s = delay_margin(believed, bandwidth, 0.1)
     for extra_s, settles in ((margin_s - 0.03, True), (margin_s + 0.03, False)):
@@ -195,7 +195,7 @@ def test_margin_divides_flights_that_settle_from_those_that_do_not(delay_s, band
         assert error_m < 0.03 if settles else error_m > 0.08
 
 
-def test_margins_of_the_flights_on_a_real_px4():
+def test_delay_margins_agree_with_flights_of_a_real_px4():
     """With 113 ms of unknown delay bandwidth 5 flew, 7 diverged, and 10 was worse."""
     margins = [delay_margin(PX4, bandwidth, 0.1) for bandwidth in (3.0, 5.0, 7.0, 10.0)]
     assert margins == sorted(margins, reverse=True)
@@ -220,7 +220,7 @@ def test_bandwidth_is_lowered_until_the_margin_suffices(delay_s, sd_s):
 
 
 @pytest.mark.parametrize("wrong_s", [-0.09, 0.09])
-def test_bandwidth_allows_for_an_uncertain_delay_of_the_thrust(wrong_s):
+def test_vertical_bandwidth_allows_for_thrust_delay_uncertainty(wrong_s):
     """The delay that the steps show may be too long or too short; at 14 rad/s the height is
     unstable either way. The lateral axes do not depend on it."""
     believed = delayed(0.182).model_copy(update={"thrust_delay_s": 0.196})

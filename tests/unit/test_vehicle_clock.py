@@ -78,7 +78,7 @@ def settled(until_s: float = 10.0, **more: Any) -> VehicleClock:
 
 @pytest.mark.parametrize("rate", [0.25, 0.9, 20.0])
 @pytest.mark.parametrize(("until_s", "answers"), [(0.8, False), (10.0, True)])
-def test_a_clock_of_any_rate_is_no_late_link(rate: float, until_s: float, answers: bool) -> None:
+def test_clock_rate_is_not_taken_for_link_delay(rate: float, until_s: float, answers: bool) -> None:
     """A simulation may be slower than real time, on a busy computer, or faster. The vehicle may
     also be engaged before the rate is measured. Before any telemetry nothing is old."""
     assert VehicleClock().now_s(EPOCH_S) == -math.inf
@@ -103,7 +103,7 @@ BOOTS: tuple[tuple[Callable[[float], float], float], ...] = (  # stamps, and whe
 
 
 @pytest.mark.parametrize("answers", [True, False])
-def test_what_the_clock_did_at_boot_is_over(answers: bool) -> None:
+def test_clock_changes_at_boot_do_not_count_in_flight(answers: bool) -> None:
     """When the flight begins, the clock has its present rate; jumps before that do not count."""
     for stamp, engaged_s in BOOTS:
         clock = settled(engaged_s, stamp=stamp, answers=answers)
@@ -115,9 +115,7 @@ def test_what_the_clock_did_at_boot_is_over(answers: bool) -> None:
 
 
 @pytest.mark.parametrize(("added_s", "ramp_s", "answers"), [(0.3, 0.02, True), (0.4, 4.0, False)])
-def test_telemetry_that_becomes_later_is_as_old_as_it_is(
-    added_s: float, ramp_s: float, answers: bool
-) -> None:
+def test_age_of_delayed_telemetry_is_measured(added_s: float, ramp_s: float, answers: bool) -> None:
     """The clock goes on although replies become later, too; the age is right within a tenth."""
 
     def down(at_s: float) -> float:
@@ -129,7 +127,7 @@ def test_telemetry_that_becomes_later_is_as_old_as_it_is(
 
 
 @pytest.mark.parametrize(("jump_s", "shown_s"), [(0.6, 0.6), (0.4, 0.0), (-1.0, 0.0)])
-def test_a_jump_forward_is_measured(jump_s: float, shown_s: float) -> None:
+def test_forward_clock_jump_is_measured(jump_s: float, shown_s: float) -> None:
     """Replies that arrived before the jump do not count."""
     clock = VehicleClock()
     fly(clock, every(0.02, 0.0, 10.0))
@@ -142,7 +140,7 @@ def test_a_jump_forward_is_measured(jump_s: float, shown_s: float) -> None:
         assert clock.age_s(newest[0], newest[1] + 0.2) == pytest.approx(0.2, abs=1e-6)
 
 
-def test_a_clock_that_becomes_slower_is_no_late_link() -> None:
+def test_slower_clock_is_not_taken_for_link_delay() -> None:
     """The computer's load changes in flight. What remains is the change between two replies."""
 
     def stamp(at_s: float) -> float:
@@ -161,7 +159,7 @@ def reply(link: VehicleClock, telemetry_s: float, delay_s: float) -> TimesyncRep
     return TimesyncReply(request_ns, request_ns + round(delay_s * 1e9))
 
 
-def test_replies_to_others_late_and_duplicate_ones_are_ignored() -> None:
+def test_foreign_late_and_duplicate_replies_are_ignored() -> None:
     link = VehicleClock()
     for number in range(5):
         at_s = float(number)
@@ -175,7 +173,7 @@ def test_replies_to_others_late_and_duplicate_ones_are_ignored() -> None:
     assert link.delay == Estimate(pytest.approx(0.05), 0.0)
 
 
-def test_all_requests_without_a_reply_count_in_the_longest_silence_s() -> None:
+def test_all_unanswered_requests_of_60_s_are_counted() -> None:
     """The requests have the shortest period. Only 100 once counted, so that with a `silence_s` of
     10 s a lost uplink was not noticed."""
     link = VehicleClock()
@@ -187,9 +185,7 @@ def test_all_requests_without_a_reply_count_in_the_longest_silence_s() -> None:
 
 
 @pytest.mark.parametrize(("lost", "late", "loses"), [(2, 0, False), (3, 0, True), (2, 5, False)])
-def test_link_loses_where_more_than_5_percent_of_50_requests_have_no_reply(
-    lost: int, late: int, loses: bool
-) -> None:
+def test_link_is_lossy_above_5_percent_missing_replies(lost: int, late: int, loses: bool) -> None:
     """Without replies to the newest requests the link may have become later: that is no loss."""
     link = VehicleClock()
     for number in range(5):
@@ -219,7 +215,7 @@ def test_link_delay_is_measured_by_twenty_replies(delay_s: float, measured_s: fl
     assert now_s == pytest.approx(measured_s, abs=0.15)
 
 
-def test_growth_is_that_of_the_median_of_five_replies() -> None:
+def test_delay_growth_is_the_median_of_five_replies() -> None:
     link, times_s = VehicleClock(), iter(0.1 * n for n in range(1, 1000))
 
     def replies(delay_s: float, count: int) -> None:
@@ -239,7 +235,7 @@ def test_growth_is_that_of_the_median_of_five_replies() -> None:
     assert link.delay_growth_s == pytest.approx(-0.04)
 
 
-def test_growth_that_comes_and_goes_stays_unsteady() -> None:
+def test_alternating_delay_counts_as_unsteady() -> None:
     growth = LinkGrowth()
     for tick in range(200):
         growth.step(0.1 * tick, 0.15 if tick // 10 % 2 else 0.05)

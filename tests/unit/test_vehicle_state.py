@@ -58,7 +58,9 @@ def armed(height_m: float = 0.0, climb_mps: float = 0.0, detector: str = "on_gro
         ({"detector": "in_air"}, False),
     ],
 )
-def test_armed_every_sign_must_say_ground(signs: dict[str, Any], certain: bool) -> None:
+def test_armed_vehicle_is_on_ground_only_if_all_signs_agree(
+    signs: dict[str, Any], certain: bool
+) -> None:
     vehicle = armed(**signs)
     assert vehicle.at(1.0).on_ground is certain
     assert vehicle.at(1.0).in_the_air is not certain
@@ -80,7 +82,7 @@ def test_armed_every_sign_must_say_ground(signs: dict[str, Any], certain: bool) 
         ((0.04, 0.04, 0.04), 3.0, False),  # an estimate that is in motion on the ground
     ],
 )
-def test_lifted_off_after_three_positions_in_a_row(
+def test_lift_off_needs_three_positions_in_a_row(
     heights_m: tuple[float, ...], climb_mps: float, lifted: bool
 ) -> None:
     standing = armed()
@@ -100,7 +102,9 @@ def test_lifted_off_after_three_positions_in_a_row(
         (0.0, 0.0, 13.0, False),
     ],
 )
-def test_stood_for_fifteen_seconds(low_m: float, high_m: float, for_s: float, stood: bool) -> None:
+def test_standing_needs_15_s_without_motion(
+    low_m: float, high_m: float, for_s: float, stood: bool
+) -> None:
     standing = armed(height_m=low_m)
     for number in range(1, round(10 * for_s) + 1):
         standing.position(1.0 + 0.1 * number, high_m if number % 2 else low_m)
@@ -130,7 +134,7 @@ def found(sd_m: float, jump_m: float) -> list[float]:
 @pytest.mark.parametrize(
     ("sd_m", "jump_m"), [(0.0, 0.35), (0.02, 0.5), (0.05, 0.0), (0.07, 0.0), (0.1, 2.0), (0.2, 0.0)]
 )
-def test_a_jump_is_found_and_noise_is_none(sd_m: float, jump_m: float) -> None:
+def test_position_jumps_are_found_and_noise_is_ignored(sd_m: float, jump_m: float) -> None:
     assert found(sd_m, jump_m) == [pytest.approx(jump_m, abs=6.0 * sd_m + 1e-9)][: jump_m > 0.0]
 
 
@@ -145,7 +149,7 @@ def attitude(time_s: float) -> Attitude:
     return Attitude(time_s, (1.0, 0.0, 0.0, 0.0), (0.0,) * 3)
 
 
-def test_an_outage_of_the_whole_link_does_not_count_as_age() -> None:
+def test_link_outage_does_not_count_as_telemetry_age() -> None:
     """Both streams arrive at 10 Hz until 10 s; the next message comes at 10.9 s."""
     state = VehicleState()
     for time_s in np.arange(1, 101) / 10.0:
@@ -160,7 +164,7 @@ def test_an_outage_of_the_whole_link_does_not_count_as_age() -> None:
     assert state.position_age_s == pytest.approx(0.0)
 
 
-def test_what_the_vehicle_says_ends_a_sentence_down_to_a_notice() -> None:
+def test_explanation_quotes_vehicle_texts_down_to_notice() -> None:
     """Only by a NOTICE ArduCopter says that a fence made it leave the mode; we once reported the
     change of mode without a reason."""
     vehicle = VehicleState()
