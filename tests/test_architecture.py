@@ -42,7 +42,7 @@ def test_only_the_clock_reads_the_time() -> None:
     assert _importers("time", "datetime") == {"offboard/link/clock.py"}
 
 
-def test_only_the_edges_open_sockets() -> None:
+def test_only_listed_modules_import_socket() -> None:
     edges = {f"offboard/link/{name}.py" for name in ("connection", "lock", "stream", "udp")}
     edges |= {f"offboard/supervisor/{name}.py" for name in ("supervisor", "process")}
     edges |= {"simulator/link/sockets.py"}
@@ -51,7 +51,7 @@ def test_only_the_edges_open_sockets() -> None:
     assert _importers("select") <= edges | pipes
 
 
-def test_the_flight_itself_does_no_io() -> None:
+def test_flight_package_does_no_io() -> None:
     outside = {"os", "pathlib", "select", "signal", "socket", "subprocess", "threading"}
     for path in (ROOT / "offboard" / "flight").glob("*.py"):
         names = _names(path)
@@ -68,7 +68,7 @@ def test_the_simulator_imports_only_four_parts_of_offboard() -> None:
     assert {name for name in ours - allowed if not name.startswith(SHARED)} == set()
 
 
-def test_one_place_makes_a_setpoint() -> None:
+def test_only_the_outbox_creates_setpoints() -> None:
     makers = {
         str(path.relative_to(ROOT))
         for path in SOURCES
@@ -80,7 +80,7 @@ def test_one_place_makes_a_setpoint() -> None:
     assert makers == {"offboard/flight/outbox.py"}
 
 
-def test_top_level_holds_only_what_the_layout_names() -> None:
+def test_repository_root_has_only_listed_entries() -> None:
     listed = subprocess.run(
         ("git", "ls-files"), cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.split()

@@ -41,13 +41,13 @@ def _commands() -> list[str]:
     return [line for block in blocks for line in block.strip().splitlines()]
 
 
-def test_ci_runs_the_test_command_unchanged() -> None:
+def test_ci_runs_the_test_command_of_the_readme() -> None:
     command = _commands()[1]
     assert command.endswith("pytest -n auto")
     assert command in (ROOT / ".ci" / "run").read_text().splitlines()
 
 
-def test_the_workflow_leaves_out_only_tests_that_exist() -> None:
+def test_ci_workflow_excludes_only_existing_tests() -> None:
     workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text()
     left_out = re.findall(r"--(?:ignore|deselect)=([\w/.]+)(?:::(\w+))?", workflow)
     assert left_out
@@ -56,7 +56,7 @@ def test_the_workflow_leaves_out_only_tests_that_exist() -> None:
         assert wanted in (ROOT / file).read_text(), f"{file}::{test}"
 
 
-def test_the_first_command_flies_prints_and_scores_and_the_report_follows(
+def test_first_readme_command_flies_scores_and_writes_a_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     install, _, fly = _commands()[0].rpartition(" && ")
@@ -117,7 +117,7 @@ def _path(picture: str) -> np.ndarray:
 
 @pytest.mark.slow  # README.md itself: tests/process/test_pytest_plugins.py
 @pytest.mark.parametrize("readme", sorted(_examples().keys() - {"README.md"}))
-def test_python_examples_run(readme: str, tmp_path: Path) -> None:
+def test_readme_python_examples_run(readme: str, tmp_path: Path) -> None:
     blocks = _examples()[readme]
     for number, block in enumerate(blocks):
         (tmp_path / f"test_{number}.py").write_text(block)
@@ -133,12 +133,12 @@ def test_python_examples_run(readme: str, tmp_path: Path) -> None:
     assert expected in done.stdout, f"{readme}: {done.stdout}{done.stderr}"
 
 
-def test_every_command_is_described() -> None:
+def test_readme_names_every_command() -> None:
     named = {info.name or info.callback.__name__ for info in app.registered_commands}
     assert {name for name in named if f"offboard {name}" not in README} == set()
 
 
-def test_links_lead_to_files() -> None:
+def test_readme_links_lead_to_files() -> None:
     for readme in (
         ROOT / "README.md",
         ROOT / "CONTRIBUTING.md",

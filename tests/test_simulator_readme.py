@@ -65,11 +65,11 @@ def with_tables(text: str) -> str:
 
 
 @pytest.mark.parametrize("firmware", FIRMWARES.values(), ids=FIRMWARES)
-def test_the_state_table_is_the_one_in_the_code(firmware: Firmware) -> None:
+def test_state_tables_match_the_code(firmware: Firmware) -> None:
     assert table(firmware) in README.read_text(), "run: python tests/test_simulator_readme.py"
 
 
-def test_every_fault_is_in_the_table_with_its_keys_and_scenarios_that_have_it() -> None:
+def test_fault_table_lists_every_fault_with_keys_and_scenarios() -> None:
     faults = get_args(get_args(Fault)[0])
     named = {get_args(fault.model_fields["fault"].annotation)[0]: fault for fault in faults}
     section = README.read_text().partition("## Faults")[2].partition("## Behaviours")[0]
@@ -115,7 +115,7 @@ def exists(firmware: Firmware, condition: str) -> bool:
 
 
 @pytest.mark.parametrize("firmware", FIRMWARES.values(), ids=FIRMWARES)
-def test_rows_name_only_what_exists(firmware: Firmware) -> None:
+def test_rules_name_only_existing_events_modes_and_parameters(firmware: Firmware) -> None:
     assert [(rule, name) for rule in firmware.rules for name in unknown(firmware, rule)] == []
     assert len(firmware.rules) > 50
     wrong = Rule("arm", when=("not amred", "COM_X=1"), to="LND")
@@ -126,7 +126,7 @@ def test_rows_name_only_what_exists(firmware: Firmware) -> None:
     assert [exists(firmware, f"{known}={values}") for values in ("1,2", "1,,2")] == [True, False]
 
 
-def test_both_firmwares_have_the_same_roles() -> None:
+def test_both_firmwares_have_the_same_parameter_roles() -> None:
     px4, ardupilot = (firmware.parameter_roles.keys() for firmware in FIRMWARES.values())
     assert px4 == ardupilot
 

@@ -60,7 +60,7 @@ def situations() -> list[Situation]:
     [("paper", None, 0), ("pid", None, 0), ("lqr", None, 0), ("pso", None, 0), ("mpc", 10, 0),
      ("horizon", 10, 0), ("horizon", 20, 1), ("horizon", 20, 3)],
 )  # fmt: skip
-def test_decision(law: str, steps: int | None, volumes: int, benchmark: Any) -> None:
+def test_time_of_one_decision(law: str, steps: int | None, volumes: int, benchmark: Any) -> None:
     """The 99th percentile of 1000 is printed with `-s` and kept by `--benchmark-json`; on a busy
     machine ask for `--benchmark-timer=time.process_time`."""
     settings: dict[str, Any] = {"law": law}
@@ -92,7 +92,7 @@ def _fly(instance: Instance, duration_s: float) -> int:
 @pytest.mark.parametrize(
     "start", [None, Start(height_m=3.0)], ids=["on the ground", "holding position"]
 )
-def test_a_second_in_memory(benchmark: Any, start: Start | None) -> None:
+def test_time_of_one_simulated_second(benchmark: Any, start: Start | None) -> None:
     vehicle, conditions = config.vehicle(PX4.vehicle), Conditions(estimator=EstimatorName.PX4_LIKE)
     instance = Instance(PX4, vehicle, conditions, 1, lockstep=True, ground_link=False, start=start)
     _fly(instance, 6.0)
@@ -101,7 +101,7 @@ def test_a_second_in_memory(benchmark: Any, start: Start | None) -> None:
 
 
 @pytest.mark.benchmark(group="twenty vehicles in real time")
-def test_instances(benchmark: Any) -> None:
+def test_time_of_twenty_instances(benchmark: Any) -> None:
     """The last line says how many steps ended later than the next one was due."""
     command = [sys.executable, "-m", "simulator", "--instances", "20", "--gcs", "none",
                "--connect", "udpout:127.0.0.1:24540", "--duration", "5"]  # fmt: skip

@@ -27,7 +27,7 @@ PATIENT = ("--set", "limits.link_growth_s=2", "--set", "limits.setpoint_age_s=2"
 LATE = ("--set", "limits.silence_s=5", "--set", "limits.missed_decisions=50")
 
 
-def test_an_arducopter_takes_off_lands_and_boots_again(tmp_path: Path) -> None:
+def test_mavproxy_flies_and_reboots_arducopter(tmp_path: Path) -> None:
     """Time runs six times as fast, and the vehicle boots in 4 s instead of 42 s."""
     starts = tmp_path / "starts.yaml"
     starts.write_text("name: starts\ndescription: Soon.\nconditions: {boot_scale: 0.1}\n")
@@ -91,7 +91,7 @@ def fly(port: int, directory: Path, key: Path, meanwhile: Callable[[], object]) 
 
 
 @pytest.mark.slow
-def test_a_signed_flight_behind_a_router_beside_a_ground_station(tmp_path: Path) -> None:
+def test_signed_flight_works_with_mavproxy_as_router(tmp_path: Path) -> None:
     """MAVProxy gives the vehicle its key, as `offboard key` says, and forwards messages. The
     station hears the vehicle, and acknowledgements reach the sender of the command."""
     passphrase = create_key(tmp_path / "key")

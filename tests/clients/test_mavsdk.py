@@ -45,7 +45,7 @@ SHORT = [*STEPS[:6], *STEPS[11:13]]
     ],
     ids=["takes off and lands", "whole session"],
 )
-def test_the_vehicle_does_what_px4_did(
+def test_mavsdk_session_runs_as_on_a_real_px4(
     options: list[str], simulated: list[str], steps: Any
 ) -> None:
     with vehicle(*simulated) as port:

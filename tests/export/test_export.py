@@ -63,7 +63,9 @@ def exported(flight: Path, kind: str, output: Path, *options: str) -> Path:
     return output
 
 
-def test_mcap(flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_path: Path) -> None:
+def test_mcap_export_matches_the_log(
+    flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_path: Path
+) -> None:
     path = exported(flight, "mcap", tmp_path / "flight.mcap")
     found: dict[str, list[tuple[int, Any]]] = {}
     with path.open("rb") as file:
@@ -117,7 +119,9 @@ def test_mcap(flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_pat
     assert summary.statistics.message_end_time <= (stamps[-1] + 1_000_000) * 1000
 
 
-def test_ulog(flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_path: Path) -> None:
+def test_ulog_export_matches_the_log(
+    flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_path: Path
+) -> None:
     log = ULog(str(exported(flight, "ulog", tmp_path / "flight.ulg")))
     assert not log.file_corruption
     assert log.msg_info_dict["sys_name"] == "PX4"
@@ -147,7 +151,9 @@ def test_ulog(flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_pat
     assert any("takeoff: armed" in text for text in texts)
 
 
-def test_table(flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_path: Path) -> None:
+def test_csv_export_matches_the_log(
+    flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_path: Path
+) -> None:
     path = exported(flight, "csv", tmp_path / "flight.csv")
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -175,7 +181,7 @@ def test_table(flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_pa
     assert all(name.endswith(units) for name in measured)
 
 
-def test_unix_time_across_the_wrap_of_time_boot_ms(tmp_path: Path) -> None:
+def test_unix_time_continues_across_the_wrap_of_time_boot_ms(tmp_path: Path) -> None:
     """The log of a vehicle at twice the speed: a position every 100 ms, recorded every 50 ms."""
     vehicle, began_us = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), 10**15
     frames = [mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3)]
@@ -191,7 +197,9 @@ def test_unix_time_across_the_wrap_of_time_boot_ms(tmp_path: Path) -> None:
     assert unix_s == pytest.approx([1e9 + 0.05 * n for n in range(1, 21)], abs=1e-4, rel=0)
 
 
-def test_our_announcements_and_a_second_vehicle(flight: Path, tmp_path: Path) -> None:
+def test_export_includes_event_records_and_ignores_a_second_vehicle(
+    flight: Path, tmp_path: Path
+) -> None:
     """Vehicle 9, whose clock is 1000 s ahead, changes no time. A record of an event is one more."""
     other = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
     (event,) = event_record.pieces(event_record.EventRecord("bandwidth 5.0 rad/s"))
@@ -217,14 +225,16 @@ def test_our_announcements_and_a_second_vehicle(flight: Path, tmp_path: Path) ->
     assert "bandwidth 5.0 rad/s" in CliRunner().invoke(app, ["score", str(two)]).output
 
 
-def test_a_phase_of_another_version_keeps_its_number(flight: Path) -> None:
+def test_unknown_phase_is_exported_as_its_number(flight: Path) -> None:
     rows = read(flight).records[:1].copy()
     rows["phase"] = 99.0
     ((*_, known),) = samples("decision", rows)
     assert known["decision_phase"] == 99.0
 
 
-def test_refusals(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_refuses_bad_outputs_and_missing_packages(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     taken = tmp_path / "taken.csv"
     taken.write_text("mine")
     assert "exists already" in run(flight, "csv", taken).output
@@ -239,7 +249,7 @@ def test_refusals(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("kind", ["mcap", "csv"])
-def test_a_full_disk_leaves_nothing(kind: str, flight: Path, tmp_path: Path) -> None:
+def test_export_to_a_full_disk_leaves_no_file(kind: str, flight: Path, tmp_path: Path) -> None:
     """The last byte does not fit, which is written when the file is closed."""
     size = exported(flight, kind, tmp_path / "whole").stat().st_size
     with full_disk(size - 1):

@@ -107,7 +107,7 @@ def dragless(lopsided: Vehicle) -> Vehicle:
     )
 
 
-def test_free_spin_keeps_energy_and_angular_momentum(dragless: Vehicle) -> None:
+def test_free_spin_conserves_energy_and_angular_momentum(dragless: Vehicle) -> None:
     """An asymmetric body spins without torque near its unstable middle axis; momentum is in NED."""
     inertia = np.array(dragless.inertia_kgm2)
 
@@ -126,7 +126,7 @@ def test_free_spin_keeps_energy_and_angular_momentum(dragless: Vehicle) -> None:
     assert np.linalg.norm(state[ATTITUDE]) == pytest.approx(1.0, abs=1e-15)
 
 
-def test_acceleration_is_newtons_in_the_inertial_frame(lopsided: Vehicle) -> None:
+def test_acceleration_agrees_with_newtons_law(lopsided: Vehicle) -> None:
     """m a = m g + R (lift along -z - (D + q |u|) u), u = R^T (v - wind), with SciPy's rotation."""
     wind, inputs = np.array([2.0, -1.0, 0.5]), np.array([15.0, 0.1, -0.2, 0.05])
     parameters = pack(lopsided)
@@ -153,7 +153,7 @@ def manoeuvre(vehicle: Vehicle, seed: int) -> Callable[[float], Array]:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_both_charts_fly_the_same_manoeuvre(lopsided: Vehicle, seed: int) -> None:
+def test_euler_and_quaternion_models_fly_the_same_manoeuvre(lopsided: Vehicle, seed: int) -> None:
     euler, quaternion = np.zeros(12), quaternion_state(np.zeros(12))
     inputs, parameters = manoeuvre(lopsided, seed), pack(lopsided)
     wind, steepest, drift = np.array([1.0, -2.0, 0.3]), 0.0, 0.0
@@ -183,7 +183,7 @@ def test_rk4_global_error_falls_with_the_fourth_power(lopsided: Vehicle) -> None
     assert order == pytest.approx(4.0, abs=0.15)
 
 
-def test_a_batch_is_the_loop_and_machine_code_steps_as_python_does(lopsided: Vehicle) -> None:
+def test_batches_and_compiled_steps_agree_with_python(lopsided: Vehicle) -> None:
     generator, parameters = np.random.default_rng(5), pack(lopsided)
     inputs = hover_input(lopsided) + generator.normal(0, 0.1, (4, 4))
     wind = generator.normal(0, 2.0, (3, 1, 3))
@@ -201,7 +201,7 @@ def test_a_batch_is_the_loop_and_machine_code_steps_as_python_does(lopsided: Veh
             assert_allclose(found, expected, rtol=1e-14, atol=1e-14)
 
 
-def test_other_lengths_are_refused(lopsided: Vehicle) -> None:
+def test_arrays_of_wrong_length_are_refused(lopsided: Vehicle) -> None:
     for shapes in ((11, 4, 3), (12, 3, 3), (13, 4, 2)):
         state, inputs, wind = map(np.zeros, shapes)
         with pytest.raises(ValueError, match="12 or 13, 4 and 3"):
@@ -229,7 +229,7 @@ EQ_16 = {
 }
 
 
-def test_the_sampled_model_is_the_exponential_and_eq_16_to_four_digits() -> None:
+def test_sampled_model_agrees_with_scipy_and_eq_16() -> None:
     """The exponential is that of the augmented matrix (zero-order hold) at 0.1 s."""
     a, b = hover_matrices(PAPER)
     augmented = expm(0.1 * np.block([[a, b], [np.zeros((4, 16))]]))

@@ -72,7 +72,7 @@ def test_angular_acceleration_is_limited_on_a_large_step():
     assert times[np.argmax(rates > 2.0)] > 2.0 / limit
 
 
-def test_loop_closes_on_the_estimate_and_not_on_the_truth():
+def test_attitude_loop_controls_the_estimated_attitude():
     vehicle = load("px4_sih")
     plant = hovering(vehicle, Conditions(estimator="px4_like"), seed=5)
     demand = Demand(True, vehicle.hover_thrust, attitude())
@@ -135,7 +135,7 @@ def test_thrust_follows_with_delay_and_first_order_lag():
     assert share[-1] == pytest.approx(1.0, abs=1e-3)
 
 
-def test_motors_off_in_the_air_is_free_fall_with_drag():
+def test_vehicle_with_motors_off_falls_with_drag():
     plant = hovering(PX4)
     times, down = response(plant, Demand(False), 0.6, _down_velocity)
     rate = PX4.drag_translation_npmps[2] / PX4.mass_kg
@@ -148,7 +148,7 @@ def test_motors_off_in_the_air_is_free_fall_with_drag():
 
 
 @pytest.mark.parametrize("share", [0.5, 0.98])
-def test_vehicle_stays_on_the_ground_below_its_weight(share):
+def test_thrust_below_the_weight_does_not_lift_off(share):
     tilted = attitude(roll_deg=15.0)
     plant = Plant(PX4, Conditions(wind_ned_mps=(4.0, -3.0, 0.0)), 1)
     plant.advance(5.0, Demand(True, share * PX4.hover_thrust, LEVEL))
@@ -163,7 +163,7 @@ def test_vehicle_stays_on_the_ground_below_its_weight(share):
         assert np.abs(truth.velocity_ned_mps).max() < 1e-12
 
 
-def test_crash_upside_down_at_speed_is_survived_and_ends_level():
+def test_vehicle_comes_to_rest_level_after_an_inverted_crash():
     plant = Plant(PX4, Conditions(), 1)
     plant.advance(4.0, Demand(True, 0.9, LEVEL))
     plant.advance(0.8, Demand(True, 0.5, attitude(roll_deg=180.0, yaw_deg=40.0)))
@@ -178,7 +178,7 @@ def test_crash_upside_down_at_speed_is_survived_and_ends_level():
     assert np.abs(truth.velocity_ned_mps).max() < 1e-12
 
 
-def test_battery_empties_by_the_current_and_sags_under_load():
+def test_battery_discharges_and_sags_under_load():
     battery = Battery(capacity_ah=1.0, hover_current_a=12.0, resistance_ohm=0.05)
     plant = Plant(PX4, Conditions(battery=battery), 1)
     full = plant.battery
@@ -192,7 +192,7 @@ def test_battery_empties_by_the_current_and_sags_under_load():
     assert plant.battery.remaining == 0.0
 
 
-def test_a_vehicle_of_almost_pure_drag_stays_finite():
+def test_vehicle_with_very_high_drag_stays_finite():
     """Explicit integration of a drag of 1000 1/s in steps of 4 ms would diverge."""
     drag = {"drag_translation_npmps": (20.0,) * 3, "drag_rotation_nmpradps": (5.0,) * 3}
     feather = PX4.model_copy(update={"mass_kg": 0.02, "inertia_kgm2": (0.01,) * 3, **drag})
@@ -217,14 +217,14 @@ def _fly(seed: int, cut: int) -> bytes:
     return plant.report().tobytes() + plant.wind_ned_mps.tobytes()
 
 
-def test_same_seed_gives_the_same_bytes_however_time_is_cut():
+def test_same_seed_gives_the_same_bytes_for_any_time_slicing():
     assert _fly(17, 1) == _fly(17, 24) == _fly(17, 240) != _fly(18, 240)
 
 
 HOSTILE = [math.nan, math.inf, -math.inf, 0.0, -1.0, 1e300, -1e300, 1e-300, 1.5, 0.5]
 
 
-def test_hostile_demands_never_make_anything_infinite():
+def test_invalid_demands_keep_the_state_finite():
     generator = np.random.default_rng(42)
     plant = Plant(PX4, ROUGH, 1)
     for _ in range(30_000):

@@ -74,11 +74,13 @@ def _rms(values: np.ndarray) -> np.ndarray:
         ("ardupilot_like", "yaw", (math.radians(0.5),), 0.25),
     ],
 )
-def test_error_has_the_measured_standard_deviation(errors, estimator, quantity, measured, slack):
+def test_estimator_error_has_the_measured_standard_deviation(
+    errors, estimator, quantity, measured, slack
+):
     assert _rms(errors[estimator][quantity]) == pytest.approx(measured, rel=slack)
 
 
-def test_px4_velocity_is_not_the_derivative_of_its_position_and_ardupilot_nearly(errors):
+def test_velocity_and_position_disagree_as_measured(errors):
     """Measured sd of (mean reported velocity - change of reported position / time), N and E, in
     m/s: PX4 0.17 to 0.29 for seconds; ArduCopter, noisy, 0.05 to 0.06 over 1 s, 0.02 over 4 s."""
     found = {}
@@ -119,7 +121,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize(("estimator", "quantity"), CHANGES)
-def test_error_changes_as_much_as_measured_over_every_time(errors, estimator, quantity):
+def test_estimator_error_changes_over_time_as_measured(errors, estimator, quantity):
     values, measured = errors[estimator][quantity], np.array(CHANGES[estimator, quantity])
     lags = [round(seconds * RATE_HZ) for seconds in CHANGES_S[-measured.shape[1] :]]
     found = [(values[:, lag:] - values[:, :-lag]).std(axis=(0, 1)) for lag in lags]
@@ -127,7 +129,7 @@ def test_error_changes_as_much_as_measured_over_every_time(errors, estimator, qu
     assert 1e3 * np.transpose(found) == pytest.approx(measured, rel=slack)
 
 
-def test_perfect_estimator_reports_the_truth_but_never_the_same_twice():
+def test_perfect_estimator_reports_the_truth_without_repeats():
     plant = hovering(load("px4_sih"), Conditions(gusts={"intensity_mps": 1.0}))
     truth, seen = plant.truth, estimate_of(plant)
     for name in ("position_ned_m", "velocity_ned_mps", "attitude", "rates_frd_radps"):
@@ -141,7 +143,7 @@ def test_perfect_estimator_reports_the_truth_but_never_the_same_twice():
     assert len(set(estimates)) == 100
 
 
-def test_ardupilots_estimate_lags_behind_motion_as_its_gps_does():
+def test_ardupilot_estimate_lags_the_motion_as_measured():
     """Circles of 1.57 rad/s: estimate minus truth is minus 0.0225 s times the true velocity through
     a filter of 1.6 rad/s and damping 0.55; with real ArduCopter 4.6 SITL it was 0.026 and 0.024 m
     (sd) for each 1 m/s (sd), east on two lemniscates of 8 s."""
@@ -180,7 +182,7 @@ def _winds(count: int, step_s: float, wind_ned_mps: tuple[float, float, float]) 
     return winds
 
 
-def test_gusts_have_drydens_spectrum_on_all_axes_whatever_way_the_wind_blows():
+def test_gusts_have_the_dryden_spectrum_on_all_axes():
     """MIL-F-8785C: u: 2 s^2 T / (1 + (T w)^2); v, w: s^2 T (1 + 3 (T w)^2) / (1 + (T w)^2)^2. The
     wind blows east, so that u is east."""
     step_s = 0.05
@@ -199,7 +201,7 @@ def test_gusts_have_drydens_spectrum_on_all_axes_whatever_way_the_wind_blows():
             assert np.mean(part) == pytest.approx(1.0, abs=0.15)
 
 
-def test_gusts_are_driven_by_normals_that_are_standard_and_independent():
+def test_gusts_are_driven_by_independent_standard_normals():
     """Along the wind gusts are a first-order process with a time constant of 2 s, inverted here."""
     along, kept = _winds(20_000, STEP_S, (0.0, 0.0, 0.0))[:, 0], math.exp(-STEP_S / 2.0)
     normals = (along[1:] - kept * along[:-1]) / (2.0 * math.sqrt(1.0 - kept**2))

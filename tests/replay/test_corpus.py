@@ -13,7 +13,7 @@ from offboard.replay.difference import compare, explained
 
 
 @pytest.mark.parametrize("name", names())
-def test_the_flight_is_replayed(name: str) -> None:
+def test_corpus_flight_replays_as_expected(name: str) -> None:
     with unpacked(name) as recording:
         replay = replayed(recording)
         comparison = compare(expected(name), replay.replayed)
@@ -24,7 +24,7 @@ def test_the_flight_is_replayed(name: str) -> None:
             pytest.fail("\n".join((comparison.sentence(), *lines)), pytrace=False)
 
 
-def test_the_corpus_is_there() -> None:
+def test_corpus_has_at_least_four_flights() -> None:
     assert len(names()) >= 4
 
 

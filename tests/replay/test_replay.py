@@ -79,7 +79,7 @@ def change_the_law(monkeypatch: pytest.MonkeyPatch, more_mps2: float) -> None:
     monkeypatch.setattr(PsoLaw, "decide", changed)
 
 
-def test_reports_of_the_recorded_setpoints_are_no_second_sender(
+def test_recorded_attitude_targets_are_not_a_second_sender(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The recorded ATTITUDE_TARGET of a real PX4 do not end the replay of a changed law."""
@@ -93,7 +93,7 @@ def test_reports_of_the_recorded_setpoints_are_no_second_sender(
 # ------------------------------------------------------------------ what it says
 
 
-def test_a_changed_law_is_found_at_its_first_decision(
+def test_replay_finds_a_changed_law_at_its_first_decision(
     flight: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A thrust of 0.01 m/s^2 more is 0.00043 of full thrust, by the vehicle file's hover thrust."""
@@ -114,7 +114,7 @@ def test_a_changed_law_is_found_at_its_first_decision(
 
 
 @pytest.mark.parametrize(("by", "significant"), [(6e-8, 0), (4e-6, 1)])
-def test_the_rounding_of_another_computer_is_no_difference(by: float, significant: int) -> None:
+def test_float_rounding_is_not_a_significant_difference(by: float, significant: int) -> None:
     """The last bit of a float32 between 0.5 and 1 is 6e-8."""
     sent = next(each for each in expected(SMALLEST) if each.message_id == 82)
     setpoint = bytearray(sent.payload.ljust(39, b"\0"))
@@ -129,7 +129,7 @@ def test_the_rounding_of_another_computer_is_no_difference(by: float, significan
 # ------------------------------------------------------------------ what it refuses
 
 
-def test_logs_that_cannot_be_replayed(flight: Path, tmp_path: Path) -> None:
+def test_logs_without_needed_records_are_refused(flight: Path, tmp_path: Path) -> None:
     old, silent = tmp_path / "old.tlog", tmp_path / "silent.tlog"
     old.write_bytes(without(flight, lambda message: record_type(message) == INPUTS_TYPE))
     silent.write_bytes(without(flight, lambda message: record_type(message) is None))
@@ -148,7 +148,7 @@ def without(flight: Path, drops) -> bytes:
     return b"".join(kept)
 
 
-def test_a_lost_message_ends_the_comparison_before_it(failed: Pair, tmp_path: Path) -> None:
+def test_comparison_ends_before_a_lost_message(failed: Pair, tmp_path: Path) -> None:
     """One LOCAL_POSITION_NED is damaged: what was sent before is still compared, and the command
     says up to which time."""
     damaged, lost_ms = logged(failed, tmp_path / "damaged.tlog"), 10_000
@@ -224,7 +224,7 @@ def check(pair: Pair, tmp_path: Path, least: int) -> None:
     assert replay.companion.outcome == pair.companion.outcome
 
 
-def test_a_program_with_our_ids_a_stop_and_a_pause(tmp_path: Path) -> None:
+def test_replay_reproduces_a_flight_with_duplicate_ids_and_a_pause(tmp_path: Path) -> None:
     """Frames of another program, which the log does not hold as received, end the flight."""
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
     forged = mavlink.MAVLink_heartbeat_message(18, 8, 0, 8, 4, 3).pack(codec)
@@ -240,7 +240,7 @@ def test_a_program_with_our_ids_a_stop_and_a_pause(tmp_path: Path) -> None:
     check(pair, tmp_path, least=40)
 
 
-def test_slow_decisions_a_stop_request_strangers_and_a_signed_link(tmp_path: Path) -> None:
+def test_replay_reproduces_a_signed_flight_with_slow_decisions(tmp_path: Path) -> None:
     """Each ninth decision is cut short by its deadline, or too late to be sent. An attacker sends
     an unsigned heartbeat every 40 ms."""
     clock = HostClock()
@@ -292,7 +292,9 @@ def failed() -> Pair:
         return short_flight()
 
 
-def test_an_error_in_a_turn(failed: Pair, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replay_reproduces_an_exception_in_a_turn(
+    failed: Pair, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The frames of the turn stay in the log, and the replay fails and lands in the same turn."""
     fail_in_a_turn(monkeypatch)
     assert failed.companion.outcome is not None
@@ -314,7 +316,7 @@ def recorded(turns: int) -> list[bytes]:
     return [piece.data for piece in recorder.pieces(all_of_it=True)]
 
 
-def test_a_missing_piece_ends_the_reading_with_a_reason() -> None:
+def test_missing_input_record_ends_the_reading_with_a_reason() -> None:
     pieces = recorded(200)
     assert len(pieces) > 8
     with pytest.raises(InputsError, match="piece 3 is missing"):
@@ -326,7 +328,7 @@ def test_a_missing_piece_ends_the_reading_with_a_reason() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(st.data())
-def test_damaged_pieces_raise_nothing_else(data) -> None:
+def test_damaged_input_records_raise_only_inputs_error(data) -> None:
     pieces = [bytearray(piece) for piece in recorded(60)]
     for _ in range(data.draw(st.integers(1, 5))):
         piece = data.draw(st.sampled_from(pieces))
@@ -335,7 +337,7 @@ def test_damaged_pieces_raise_nothing_else(data) -> None:
         list(entries(map(bytes, pieces)))
 
 
-def test_in_real_time_each_input_is_recorded() -> None:
+def test_real_time_inputs_are_recorded_with_host_time() -> None:
     """That is host time in us, senders, frames not in the log, and a count of other datagrams."""
     recorder, clock_s = InputRecorder(SessionSettings()), [100.000_250]
     read = recorder.watch(lambda: clock_s[0])
@@ -360,7 +362,7 @@ def test_in_real_time_each_input_is_recorded() -> None:
         assert found == TurnInput(turn_s, chunks, (clock_s[0],))
 
 
-def test_in_lockstep_no_host_time_is_recorded() -> None:
+def test_lockstep_inputs_are_recorded_without_host_time() -> None:
     def pieces(offset_s: float, port: int) -> list[bytes]:
         recorder = InputRecorder(SessionSettings(lockstep=True))
         read = recorder.watch(lambda: offset_s)
