@@ -28,7 +28,7 @@ from offboard.run.loop import ANSWERS, UNANSWERED, UNGUARDED, Loop
 
 FLOWN = Outcome(0, "flown and landed")
 UNIX_US = 1_767_225_600_000_000
-LONG_S = 20.0
+TIMEOUT_S = 20.0
 
 
 class Silent:
@@ -187,7 +187,7 @@ def test_a_closed_terminal_does_not_end_the_flight(tmp_path: Path, failure: Base
         (signal.SIGINT, 0.9, 0),
     ],
 )
-def test_two_signals(
+def test_second_signal_stops_the_flight_except_sighup(
     number: int, apart_s: float, turns_left: int, tmp_path: Path, now_s: list[float]
 ) -> None:
     """The first signal lands. A second one a second later exits at once, except SIGHUP."""
@@ -204,7 +204,7 @@ def test_two_signals(
     assert (outcome.exit_code == 0) is (turns_left == 0)
 
 
-def test_an_interrupted_landing_is_no_result(tmp_path: Path, now_s: list[float]) -> None:
+def test_landing_interrupted_by_signals_is_aborted(tmp_path: Path, now_s: list[float]) -> None:
     class Landing(Brief):
         outcome = Outcome(ExitCode.FLOWN, "stop requested")
 
@@ -254,7 +254,7 @@ def test_an_ignored_sighup_stays_ignored(tmp_path: Path) -> None:
 # -- the supervisor --------------------------------------------------------------------------------
 
 
-def test_what_a_turn_decided_is_dropped_when_it_became_too_old(tmp_path: Path) -> None:
+def test_messages_of_a_slow_turn_are_dropped(tmp_path: Path) -> None:
     """This happens if the process is stopped between the decision and sending. A dropped text stays
     in the log as an event record, which is never sent."""
 
@@ -272,7 +272,7 @@ def test_what_a_turn_decided_is_dropped_when_it_became_too_old(tmp_path: Path) -
     assert (logged.count(setpoint(1)), logged.count(said(1))) == (0, 0)
 
 
-def test_what_a_turn_decided_does_not_leave_after_a_take_over(tmp_path: Path) -> None:
+def test_messages_are_not_sent_after_a_supervisor_take_over(tmp_path: Path) -> None:
     """The process was stopped during the turn, and the supervisor has taken over."""
 
     def decide(left: int) -> None:
@@ -285,7 +285,7 @@ def test_what_a_turn_decided_does_not_leave_after_a_take_over(tmp_path: Path) ->
     assert outcome == Outcome(4, f"supervisor: {'; '.join(watcher.said)}")
 
 
-def test_a_stopped_controller_leaves_the_answers_to_the_supervisor(tmp_path: Path) -> None:
+def test_controller_does_not_read_the_link_after_a_take_over(tmp_path: Path) -> None:
     """The controller was stopped while it waited for telemetry. Both processes read the same link:
     the controller must not take the COMMAND_ACKs for the supervisor's commands."""
 
@@ -297,7 +297,7 @@ def test_a_stopped_controller_leaves_the_answers_to_the_supervisor(tmp_path: Pat
     assert link.read == 2
 
 
-def test_a_supervisor_that_has_taken_over_is_not_called_silent(tmp_path: Path) -> None:
+def test_supervisor_that_took_over_is_not_reported_as_silent(tmp_path: Path) -> None:
     """The controller was stopped at the end of a turn."""
 
     def stopped(sent_s: float) -> Sequence[bytes]:
@@ -310,7 +310,7 @@ def test_a_supervisor_that_has_taken_over_is_not_called_silent(tmp_path: Path) -
     assert UNANSWERED not in flight.announced
 
 
-def test_a_supervisor_that_does_not_answer_is_announced_once_and_when_it_does(
+def test_supervisor_silence_and_return_are_announced_once(
     tmp_path: Path,
 ) -> None:
     guarded: list[bool] = []
@@ -326,7 +326,7 @@ def test_a_supervisor_that_does_not_answer_is_announced_once_and_when_it_does(
 
 
 @pytest.mark.parametrize(("phase", "restarts"), [(Phase.STANDBY, [4.0, 16.0]), (Phase.TRACK, [])])
-def test_another_supervisor_is_started_but_not_in_flight(
+def test_supervisor_is_restarted_only_outside_flight(
     phase: Phase, restarts: list[float], tmp_path: Path, now_s: list[float]
 ) -> None:
     """A start is tried every ten seconds until it succeeds."""
@@ -350,7 +350,7 @@ def test_another_supervisor_is_started_but_not_in_flight(
 
 
 @pytest.mark.parametrize("lands", [True, False], ids=["land", "go_on"])
-def test_a_log_that_cannot_be_written_is_said_at_once(
+def test_log_write_error_is_announced_in_flight(
     lands: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The disk becomes full in flight, with either value of `limits.log_lost`."""
@@ -378,7 +378,7 @@ def test_a_log_that_cannot_be_written_is_said_at_once(
 
 @pytest.mark.parametrize("phase", [Phase.TRACK, Phase.STANDBY])
 @pytest.mark.parametrize("error", [ZeroDivisionError("no"), SystemExit(3)])
-def test_an_exception_lands_and_ends_with_4(
+def test_exception_requests_a_landing_and_ends_with_code_4(
     error: BaseException, phase: Phase, tmp_path: Path
 ) -> None:
     """Except if the service is in standby again: the flight that the exception ended has an exit
@@ -400,7 +400,7 @@ def test_an_exception_lands_and_ends_with_4(
 
 
 @pytest.mark.parametrize(("simulator", "turns"), [(None, 8), (Silent(), 1)])  # 0.3 s
-def test_an_exception_in_every_turn_ends_in_silence(
+def test_exception_in_every_turn_stops_setpoints(
     simulator: object, turns: int, tmp_path: Path, now_s: list[float]
 ) -> None:
     """With the simulator the flight ends at once: in lockstep the simulator waits for the answer to
@@ -428,21 +428,21 @@ class Disk:
 
     def write(self, items: list[int]) -> None:
         self.asked.set()
-        assert self.free.wait(LONG_S)
+        assert self.free.wait(TIMEOUT_S)
         self.items += items
 
 
-def test_in_lockstep_it_waits_and_loses_nothing() -> None:
+def test_background_writer_that_waits_loses_nothing() -> None:
     disk = Disk()
     disk.free.set()
     writer = BackgroundWriter(disk.write, 100, waits=True)
     for number in range(2000):
         writer.put(number)
-    writer.close(LONG_S)
+    writer.close(TIMEOUT_S)
     assert (disk.items, writer.dropped) == ([*range(2000)], 0)
 
 
-def test_a_failure_is_kept_and_ends_the_writing() -> None:
+def test_background_writer_stops_after_an_error() -> None:
     """For example of a display: rich raises SystemExit if nobody reads its pipe."""
     failure = SystemExit(1)
 
@@ -451,12 +451,12 @@ def test_a_failure_is_kept_and_ends_the_writing() -> None:
 
     writer = BackgroundWriter(write, 100)
     writer.put(0)
-    writer.close(LONG_S)
+    writer.close(TIMEOUT_S)
     writer.put(1)
     assert (writer.error, writer.dropped) == (failure, 2)
 
 
-def test_a_disk_that_never_answers_is_named_and_all_is_counted_as_lost(
+def test_hung_disk_is_reported_with_all_entries_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk = Disk()

@@ -54,7 +54,7 @@ NOTHING, LINK, TILT, BATTERY = (), ("link",), ("tilt error",), ("battery",)
 FLY, HOLD, LAND = Action.FLY, Action.HOLD, Action.LAND
 
 
-def test_a_condition_counts_once_it_has_held_and_is_forgotten_slowly() -> None:
+def test_failsafe_rows_act_after_their_hold_time_and_decay_slowly() -> None:
     assert set(actions(*[NOTHING] * 100)) == {FLY}
     assert actions(*[LINK] * 6) == [FLY] * 4 + [HOLD] * 2
     assert actions(NOTHING, *[BATTERY] * 17)[-3:] == [FLY, LAND, LAND]
@@ -69,14 +69,14 @@ def test_a_condition_counts_once_it_has_held_and_is_forgotten_slowly() -> None:
     assert HOLD not in actions(NOTHING, *[LINK, *[NOTHING] * 4] * 100)
 
 
-def test_the_worst_active_row_counts() -> None:
+def test_worst_active_failsafe_row_decides() -> None:
     both = (*LINK, *TILT)
     assert actions(NOTHING, *[both] * 4)[-1] is LAND
     assert actions(NOTHING, *[both] * 4, *[LINK] * 2)[-1] is HOLD
     assert actions(NOTHING, *[TILT] * 2, *[LINK] * 3)[-1] is FLY
 
 
-def test_of_equally_bad_rows_the_report_of_the_mode_is_named() -> None:
+def test_missing_mode_report_is_named_first() -> None:
     """Without a report of the mode no other row has an effect."""
     flight = uneventful()
     assert flight.authority is not None
@@ -87,7 +87,7 @@ def test_of_equally_bad_rows_the_report_of_the_mode_is_named() -> None:
     assert flight.failsafe.reason.startswith("no report of the mode")
 
 
-def test_neither_a_step_back_of_time_nor_a_gap_of_telemetry_counts() -> None:
+def test_clock_steps_and_telemetry_gaps_add_no_hold_time() -> None:
     for last, action in ((50.125, HOLD), (50.0625, FLY)):
         flight = uneventful()
         for flight.vehicle.now_s in (100.0, 100.1875, 100.375, 50.0, last):
@@ -268,7 +268,7 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
 ]  # fmt: skip
 
 
-def test_every_row_at_its_limit() -> None:
+def test_every_failsafe_row_acts_beyond_its_limit() -> None:
     assert {each[0] for each in MEASURED} == set(BY_NAME)
     for name, measure, *values in MEASURED:
         for value, exceeds in zip(values, (False, True), strict=True):
@@ -280,7 +280,7 @@ def test_every_row_at_its_limit() -> None:
             assert name != "decision" or flight.failsafe.reason == exceeds * "it was late"
 
 
-def test_another_program_may_be_allowed() -> None:
+def test_begin_with_other_sender_allows_another_program() -> None:
     for name in ("second sender", "other setpoints"):
         flight = uneventful()
         hear(flight, OtherSender(1, 190))
@@ -290,7 +290,7 @@ def test_another_program_may_be_allowed() -> None:
         assert not BY_NAME[name].condition(flight)
 
 
-def test_what_only_our_setpoints_show_is_not_measured_in_other_phases() -> None:
+def test_setpoint_based_rows_are_inactive_in_hold() -> None:
     for name in ("thrust reserve", "full thrust", "other setpoints"):
         flight = uneventful(Phase.HOLD)
         sinks(flight, 5.0)

@@ -274,14 +274,14 @@ WAITED = [*PAUSED, Occurrence("report", mode="E", waited_s=0.8)]
 @MANY
 @example((WAITED, HOVER, 0.0, False, 0.0, 1.0, 0.0))  # the report arrived before the pause ended
 @given(st.tuples(HISTORY, SETPOINT, LATER, st.booleans(), TIME, st.floats(0.1, 2.0), LATE))
-def test_flights_of_one_tick(tick: Any) -> None:
+def test_admitted_setpoints_agree_with_the_oracle(tick: Any) -> None:
     judge(*tick)
 
 
 @MANY
 @example([*FLIGHT, Occurrence("report", mode="H")], 0.0)  # back from landing: a pilot's choice
 @given(HISTORY, LATER)
-def test_a_command_needs_authority(history: list[Occurrence], later_s: float) -> None:
+def test_commands_need_authority(history: list[Occurrence], later_s: float) -> None:
     authority, end_s = replayed(history, failsafes=False)
     expected = may_command(history) and is_fresh(history, later_s)
     assert authority.permits_command(end_s + later_s) is expected
@@ -303,7 +303,9 @@ def test_a_command_needs_authority(history: list[Occurrence], later_s: float) ->
         (Command(9.8, (5e-324, 5e-324, -1.0), 0.0), {}, True),
     ],
 )
-def test_the_edges(command: Command | PositionCommand, named: dict[str, float], sent: bool) -> None:
+def test_boundary_setpoints_are_admitted_or_refused(
+    command: Command | PositionCommand, named: dict[str, float], sent: bool
+) -> None:
     assert (judge(OURS, command, **named) is not None) is sent  # type: ignore[arg-type]
     assert judge([], command, **named) is None  # type: ignore[arg-type]
 
@@ -311,7 +313,7 @@ def test_the_edges(command: Command | PositionCommand, named: dict[str, float], 
 # --- a failsafe that interrupts -------------------------------------------------------------------
 
 
-def test_the_example_of_the_docstring() -> None:
+def test_authority_docstring_example_passes() -> None:
     assert doctest.testmod(module) == (0, 8)
 
 
@@ -327,7 +329,7 @@ HELD = [Occurrence("report", mode="E"), Occurrence("ask"), *FLIGHT[4:6]]
         ("E", Standing.LOST, False),
     ],
 )
-def test_a_failsafe_may_interrupt_a_mode_that_we_asked_for(
+def test_failsafe_may_interrupt_a_requested_mode(
     shown: str, standing: Standing, commands: bool
 ) -> None:
     reports = [
@@ -341,7 +343,7 @@ def test_a_failsafe_may_interrupt_a_mode_that_we_asked_for(
     )
 
 
-def test_a_failsafe_that_was_shown_within_a_pause_permits_nothing() -> None:
+def test_failsafe_shown_during_a_pause_permits_no_command() -> None:
     """A pilot may have taken the vehicle since, in the same mode."""
     authority, _ = replayed(HELD[:2])
     authority.setpoint_loss = SetpointLoss(1.0, ("POSCTL",))
@@ -367,7 +369,7 @@ def test_a_failsafe_that_was_shown_within_a_pause_permits_nothing() -> None:
     assert authority.standing is Standing.LOST
 
 
-def test_the_first_loss_is_the_one_that_is_told() -> None:
+def test_first_loss_of_authority_is_reported() -> None:
     authority, _ = replayed([*HELD[:2], Occurrence("report", mode="B")])
     authority.lose("the supervisor has it", 109.0, heartbeat=True)
     assert authority.lost_reason == "the vehicle left E for B"

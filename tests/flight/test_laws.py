@@ -34,7 +34,7 @@ def flying(controller: str, tmp_path: Path, *assignments: str, **options: object
 
 
 @pytest.mark.parametrize("law", sorted({*names()} - {"pso", "lqr", "autopilot"}))
-def test_flies_a_short_lemniscate(law: str, tmp_path: Path) -> None:
+def test_law_flies_a_short_lemniscate(law: str, tmp_path: Path) -> None:
     """Other tests fly the rest: most fly `pso`, test_link_figures `lqr`, one below `autopilot`."""
     pair = flying(law, tmp_path, *SHORT, aloft=True)
     pair.track()
@@ -57,7 +57,7 @@ def test_arducopter_flies_a_short_lemniscate_and_lands() -> None:
     assert max(moment.error_m for moment in watch.during(Phase.TRACK)) < 0.01
 
 
-def test_autopilot_gets_positions_while_tracking_and_attitudes_before(tmp_path: Path) -> None:
+def test_autopilot_law_sends_attitudes_then_positions(tmp_path: Path) -> None:
     """Its position loop may tilt by 34 deg, although no attitude that was commanded before the
     reference is near that (row "tilt error" of the failsafe)."""
     fast = ("reference.half_length_m=6", "reference.period_s=7", "reference.laps=1")
@@ -106,7 +106,7 @@ def nearest_m(volumes: list[dict[str, Any]], times: list[float], places: list[An
         pytest.param([SHED], marks=pytest.mark.slow),
     ],
 )
-def test_volumes_are_kept_clear_of(volumes: list[dict[str, Any]], tmp_path: Path) -> None:
+def test_keep_out_volumes_are_avoided(volumes: list[dict[str, Any]], tmp_path: Path) -> None:
     """The reference crosses each volume; the true position stays clear from climb to landing."""
     keep_out = f"controller.keep_out={json.dumps(volumes)}"
     pair = flying("horizon", tmp_path, "reference.laps=1", keep_out, aloft=True)
@@ -142,7 +142,7 @@ def on_a_helix(climb_mps: float, height_m: float) -> Pair:
     return make(*TURNING, climb, f"reference.height_m={height_m}", reference="helix", aloft=True)
 
 
-def test_turning_through_all_headings() -> None:
+def test_vehicle_tracks_at_all_headings() -> None:
     """One flight descends; the other faces south, where the reported heading wraps."""
     south = make("reference.course_deg=180", "reference.laps=1", scenario="px4_like", aloft=True)
     for pair, rmse_m in ((on_a_helix(-0.4, 7.0), 0.01), (south, 0.05)):
@@ -152,7 +152,7 @@ def test_turning_through_all_headings() -> None:
         assert score.rmse_heading_deg < 2.0
 
 
-def test_a_swapped_heading_is_scored() -> None:
+def test_opposite_heading_raises_the_heading_error() -> None:
     """The flight climbs, and the targets on the link have the opposite heading, by a rotation about
     the thrust axis, which does not change its direction."""
 
@@ -171,7 +171,7 @@ def test_a_swapped_heading_is_scored() -> None:
 
 
 @pytest.mark.slow
-def test_ranking_of_bandwidths() -> None:
+def test_higher_bandwidth_lowers_the_error_as_on_px4() -> None:
     """The ranking is that of a real PX4 (1.16 SITL, SIH): one lap in 8 s in `px4_like`, mean of two
     seeds, by the vehicle's estimate. White noise on the estimate would reverse the ranking."""
     lap = ("controller={law: lqr, feedback_limit: 0.6}", "reference.laps=1", "reference.height_m=1",

@@ -62,7 +62,7 @@ def unseen(tilt: dict[str, float], drag_ps: float, hover: float) -> Vehicle:
         pytest.param(unseen(SLOW, 1.2, 0.6), marks=pytest.mark.slow),
     ],
 )
-def test_unseen_vehicle_is_identified_in_flight_and_from_its_log(true: Vehicle) -> None:
+def test_unknown_vehicle_is_identified_in_flight_and_from_its_log(true: Vehicle) -> None:
     """The identification steps stay in their box, and the results are announced and recorded."""
     pair = learning(reference="identify", flies=true, aloft=False)
     away_m: list[float] = []
@@ -130,7 +130,7 @@ def test_slow_thrust_is_identified() -> None:
         ),
     ],
 )
-def test_vehicle_of_unknown_delays_is_held_until_they_are_identified(true: dict[str, Any]) -> None:
+def test_vehicle_with_unknown_delays_is_flown_within_15_cm(true: dict[str, Any]) -> None:
     """The vehicle hovers with little bandwidth. Otherwise its height would oscillate by 1 m, or it
     would reach the limit of 5 m, before the steps. If it oscillates, it is identified from that."""
     flies = unseen(QUICK, 0.15, 0.5).model_copy(update=true)
@@ -139,7 +139,7 @@ def test_vehicle_of_unknown_delays_is_held_until_they_are_identified(true: dict[
     assert pair.score().rmse_position_m < 0.15
 
 
-def test_thrust_that_gusts_leave_uncertain_is_adopted_as_such() -> None:
+def test_thrust_lag_is_identified_in_gusts() -> None:
     """The uncertainty is taken over, too. Otherwise the constants of the file would count as known,
     and the height would oscillate by 0.5 m."""
     gusts = {"intensity_mps": 4.0, "speed_mps": 12.0}
@@ -155,7 +155,7 @@ def test_thrust_that_gusts_leave_uncertain_is_adopted_as_such() -> None:
     assert pair.companion.model.thrust_lag_s == pytest.approx(0.13, abs=0.07)
 
 
-def test_thrust_that_the_steps_do_not_show_is_identified_in_motion() -> None:
+def test_thrust_delay_is_identified_in_motion() -> None:
     """From the steps, a delay plus lag of 0.27 s is identified as 0.14 +- 0.02 s, because the
     estimated height drifts. Flown with that value, the error is 0.09 m."""
     slow = AxisResponse(delay_s=0.17, natural_frequency_radps=4.8, damping=0.57)
@@ -172,7 +172,7 @@ def test_thrust_that_the_steps_do_not_show_is_identified_in_motion() -> None:
     ("frequency_radps", "damping", "error_m"),
     [(3.0, 0.8, 0.07), (6.8, 2.5, 0.06), (6.8, 3.4, 0.06)],
 )
-def test_slow_attitude_is_identified(
+def test_slow_attitude_response_is_identified(
     frequency_radps: float, damping: float, error_m: float
 ) -> None:
     """It is identified before the reference, although the steps leave the delay of the first one
@@ -192,7 +192,7 @@ def test_slow_attitude_is_identified(
     assert "(configured 7.0): the vehicle's delay is not identified yet" in said
 
 
-def test_tilt_that_the_autopilot_accelerates_slowly_is_flown() -> None:
+def test_low_angular_acceleration_limit_lowers_the_bandwidth() -> None:
     """Without the limit of the bandwidth, feedback needs more angular acceleration than the
     autopilot allows, and the flight ends at an error of 5 m."""
     cdeg = 13000.0
@@ -214,7 +214,7 @@ def test_tilt_that_the_autopilot_accelerates_slowly_is_flown() -> None:
     assert f"{limited}; identified delay" in said
 
 
-def test_tilt_that_the_autopilot_turns_slowly_is_flown() -> None:
+def test_low_angular_rate_limit_lowers_the_bandwidth() -> None:
     """PX4 allows 60 instead of 220 deg/s, after a ground station has changed its parameters in
     flight, and the link delays by 120 ms each way. Without the limit of the bandwidth the error is
     0.33 m."""
@@ -239,14 +239,14 @@ def test_tilt_that_the_autopilot_turns_slowly_is_flown() -> None:
     assert "the autopilot limits the angular rate of the tilt to 1.0 rad/s" in said
 
 
-def test_white_noise_of_positions_is_no_delay_of_the_thrust() -> None:
+def test_vehicle_with_position_noise_is_flown_within_5_cm() -> None:
     """The noise is 2 cm. The error is 0.07 m if the identification does not allow for it."""
     pair = learning(ONE_LAP, scenario="noise", seed=1, aloft=False)
     pair.track()
     assert pair.score().rmse_position_m < 0.05
 
 
-def test_vehicle_file_that_telemetry_contradicts_ends_the_flight() -> None:
+def test_contradicted_vehicle_file_ends_the_flight() -> None:
     """The reason names both values, and the vehicle lands."""
     wrong = TRUE.tilt.model_copy(update={"natural_frequency_radps": 2.5})
     pair = learning(FIVE_S, reference="hover", believed=TRUE.model_copy(update={"tilt": wrong}))
@@ -260,7 +260,7 @@ def test_vehicle_file_that_telemetry_contradicts_ends_the_flight() -> None:
 
 
 @pytest.mark.slow
-def test_attitude_loop_that_slows_is_noticed_and_flown() -> None:
+def test_slower_attitude_loop_is_noticed_in_flight() -> None:
     """The natural frequency falls from 11.4 to 5 rad/s with the same delay. If this is not noticed,
     the error is 0.98 m."""
     pair = learning()
@@ -284,7 +284,7 @@ def test_attitude_loop_that_slows_is_noticed_and_flown() -> None:
     assert pair.score().max_position_m < 0.65
 
 
-def test_mass_that_changes_in_flight_is_followed() -> None:
+def test_mass_change_in_flight_is_identified() -> None:
     """A load is picked up while the reference is flown."""
     pair = learning()
 
@@ -326,7 +326,7 @@ def test_steps_are_repeated_while_the_delay_is_uncertain(most_s: float, said: li
 @pytest.mark.parametrize(
     "fly", [on_arducopter, partial(make, vehicle="px4_sih", aloft=True)], ids=["ardupilot", "px4"]
 )
-def test_twice_the_thrust_of_the_file_is_found_before_the_take_over(
+def test_double_thrust_is_identified_before_the_take_over(
     fly: Callable[..., Pair],
 ) -> None:
     """It is found while the vehicle climbs. Otherwise ArduCopter is 8 m too high with four times
@@ -351,7 +351,9 @@ VEHICLE = simulated.vehicle("arducopter").model_copy(
 
 @settings(max_examples=20, derandomize=True, deadline=None)
 @given(st.floats(0.2, 0.7), st.floats(-1.0, 3.3), st.sampled_from((1, 10)))
-def test_hover_thrust_of_an_accelerated_climb(true: float, climb_mps: float, every: int) -> None:
+def test_hover_thrust_is_estimated_in_an_accelerated_climb(
+    true: float, climb_mps: float, every: int
+) -> None:
     """The oracle is the closed-form speed v(t) for constant thrust and linear drag. Positions
     arrive at 100 or 10 Hz."""
     gravity, drag = VEHICLE.gravity_mps2, VEHICLE.drag_per_mass_ps
@@ -368,7 +370,7 @@ def test_hover_thrust_of_an_accelerated_climb(true: float, climb_mps: float, eve
     assert hover.hover_thrust(VEHICLE, 1.0) == pytest.approx(true, rel=0.02)
 
 
-def test_no_hover_thrust_from_too_little_or_on_the_ground_or_while_it_falls() -> None:
+def test_hover_thrust_is_not_estimated_on_ground_or_falling() -> None:
     for height_m, fall_mps2, thrust in ((1.0, 9.0, 0.05), (0.0, 0.0, 0.1)):
         hover = HoverEstimate()
         assert hover.hover_thrust(TRUE, 0.0) is None

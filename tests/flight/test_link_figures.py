@@ -33,7 +33,7 @@ def over(down: Filter, *assignments: str, aloft: bool = True, **options: object)
     ],
     ids=["80 ms late, all messages three times", "stops for 80 ms in 400"],
 )
-def test_delay_and_duplicates_are_measured(
+def test_score_measures_link_delay_and_duplicates(
     down: Filter, stale_share: float, later_ms: float, rmse_m: float
 ) -> None:
     pair = over(down)
@@ -49,7 +49,7 @@ def test_delay_and_duplicates_are_measured(
     assert score.position_gap_max_s == pytest.approx(1.0 / SENT_HZ, abs=0.007)
 
 
-def test_setpoints_are_sent_twice_where_some_are_lost() -> None:
+def test_setpoints_are_sent_twice_on_a_lossy_link() -> None:
     """Each setpoint is sent again after half a period. The RMSE of this lap is 0.20 m if they are
     sent once; with the repeats it is 0.035 to 0.049 m for nine of ten seeds."""
     pair = over(through)
@@ -73,7 +73,7 @@ CONFIGURED_RADPS = 7.0
 @pytest.mark.parametrize(
     ("direction", "most_m"), [("down", 0.15), pytest.param("up", 0.2, marks=pytest.mark.slow)]
 )
-def test_late_link_is_noticed_and_flown(direction: str, most_m: float) -> None:
+def test_growing_link_delay_lowers_the_bandwidth(direction: str, most_m: float) -> None:
     """The link becomes late in flight, and later prompt again. If the delay were assumed to be that
     at take-off, 0.2 s more would cause an error of 2.1 m."""
     pair = over(through, "reference.height_m=3.0", aloft=False, boot_scale=1.0)

@@ -37,7 +37,7 @@ from offboard.mavlink.framing import FrameSplitter
 from offboard.mavlink.senders import PEER_SILENT_S
 
 LOCAL = "127.0.0.1"
-LONG_S = 10.0
+TIMEOUT_S = 10.0
 TURN_S = 1.0  # longest turn of the loop on a busy machine, whatever the link does
 Udp = tuple[UdpLink, socket.socket, socket.socket]
 IPV6 = socket.has_ipv6 and Path("/proc/net/if_inet6").exists()
@@ -56,7 +56,7 @@ def opened(address: str, ends: ExitStack) -> Link:
 
 def listening(ends: ExitStack, port: int = 0) -> socket.socket:
     server = ends.enter_context(socket.create_server(("127.0.0.1", port)))
-    server.settimeout(LONG_S)
+    server.settimeout(TIMEOUT_S)
     return server
 
 
@@ -79,7 +79,7 @@ def port(link: Link) -> int:
 def turns(link: Link, until: Callable[[bytes], object]) -> bytes:
     """Run turns of the loop until `until` holds for the bytes received, and return these. No turn
     may block."""
-    received, deadline_s = b"", time.monotonic() + LONG_S
+    received, deadline_s = b"", time.monotonic() + TIMEOUT_S
     while not until(received):
         began_s = time.monotonic()
         assert began_s < deadline_s, received
@@ -135,7 +135,7 @@ def data(chunks: list[Chunk]) -> list[bytes]:
     return [chunk.data for chunk in chunks]
 
 
-def test_a_datagram_has_the_time_of_its_arrival_not_of_its_reading(udp: Udp) -> None:
+def test_datagram_time_is_its_arrival_not_its_reading(udp: Udp) -> None:
     """If this process is interrupted, the time may be too old by the length of the interruption."""
     link, vehicle, _ = udp
     for _ in range(5):  # repeat if the computer's clock was set in the meantime
@@ -153,7 +153,7 @@ def test_a_datagram_has_the_time_of_its_arrival_not_of_its_reading(udp: Udp) -> 
 
 
 @pytest.mark.parametrize("jump_s", [-3600.0, 3600.0])
-def test_a_clock_that_is_set_does_not_move_arrivals(
+def test_clock_step_does_not_change_arrival_times(
     jump_s: float, udp: Udp, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Unix time jumps between the arrival of a datagram and its reading."""
@@ -166,7 +166,7 @@ def test_a_clock_that_is_set_does_not_move_arrivals(
     assert empty_s - 0.01 <= chunk.arrived_s <= time.monotonic()
 
 
-def test_a_clock_that_is_set_back_between_two_datagrams_keeps_their_order(
+def test_backward_clock_step_keeps_the_datagram_order(
     udp: Udp, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The kernel stamps the first one before the step of 0.6 s, the second one after it."""
@@ -181,7 +181,7 @@ def test_a_clock_that_is_set_back_between_two_datagrams_keeps_their_order(
     assert first.arrived_s <= second.arrived_s <= time.monotonic()
 
 
-def test_other_senders_are_counted_and_neither_delay_nor_displace_the_vehicle(udp: Udp) -> None:
+def test_flood_of_other_senders_does_not_displace_the_vehicle(udp: Udp) -> None:
     link, vehicle, other = udp
     other.send(b"waits already")
     vehicle.send(b"v1")
@@ -206,7 +206,7 @@ def test_other_senders_are_counted_and_neither_delay_nor_displace_the_vehicle(ud
     assert link.report.news() == []
 
 
-def test_frames_reach_the_vehicle_before_and_after_it_is_followed(udp: Udp) -> None:
+def test_udp_link_reaches_the_vehicle_and_holds_its_port_alone(udp: Udp) -> None:
     """No other program can bind the port: by SO_REUSEADDR, as pymavlink sets it, it would get the
     vehicle's datagrams."""
     link, vehicle, _ = udp
@@ -222,7 +222,7 @@ def test_frames_reach_the_vehicle_before_and_after_it_is_followed(udp: Udp) -> N
         link.follow(vehicle.getsockname())
 
 
-def test_another_port_is_said_as_the_user_writes_it() -> None:
+def test_new_peer_is_announced_as_host_and_port() -> None:
     flight = uneventful()
     for peer in (("127.0.0.1", 14581), ("::1", 14582, 0, 0)):
         telemetry.update(flight, PeerChanged(peer), 0.0, turned_s=0.0)
@@ -230,7 +230,7 @@ def test_another_port_is_said_as_the_user_writes_it() -> None:
     assert places == ["127.0.0.1:14581", "[::1]:14582"]
 
 
-def test_another_port_is_heard_after_a_silence_that_was_observed(
+def test_vehicle_may_change_its_port_after_an_observed_silence(
     udp: Udp, now_s: list[float]
 ) -> None:
     """A pause of this process, here of 3 s, is not a silence of the vehicle: its datagrams wait, or
@@ -299,7 +299,7 @@ def test_udpout_hears_only_its_peer() -> None:
     link.close()
 
 
-def test_senders_are_named_at_powers_of_ten_and_bounded_in_number() -> None:
+def test_ignored_senders_are_reported_at_powers_of_ten() -> None:
     report = LinkReport()
     for _ in range(100):
         report.count("a:1", 1)
@@ -319,7 +319,7 @@ def test_senders_are_named_at_powers_of_ten_and_bounded_in_number() -> None:
 @pytest.mark.parametrize(
     ("kind", "count"), [("tcp", 20_000), ("serial", 5_000)]
 )  # 1 MB and 250 kB exceed the buffers
-def test_a_full_stream_does_not_block_and_sends_the_newest_setpoint(
+def test_full_stream_does_not_block_and_sends_the_newest_setpoint(
     kind: str, count: int, ends: ExitStack
 ) -> None:
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
@@ -358,7 +358,7 @@ def test_a_full_stream_does_not_block_and_sends_the_newest_setpoint(
     assert frames[-2].raw == heartbeat
 
 
-def test_a_tcp_peer_that_goes_and_returns_is_connected_again(ends: ExitStack) -> None:
+def test_tcp_link_reconnects_to_a_returning_peer(ends: ExitStack) -> None:
     server = listening(ends)
     server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     port = server.getsockname()[1]
@@ -376,7 +376,7 @@ def test_a_tcp_peer_that_goes_and_returns_is_connected_again(ends: ExitStack) ->
     server = listening(ends, port)
     turns(link, lambda _: link.descriptors())
     peer = ends.enter_context(server.accept()[0])
-    peer.settimeout(LONG_S)
+    peer.settimeout(TIMEOUT_S)
     peer.sendall(b"again")
     turns(link, lambda data: data == b"again")
     assert link.report.news() == [RENEWED]
@@ -386,18 +386,18 @@ def test_a_tcp_peer_that_goes_and_returns_is_connected_again(ends: ExitStack) ->
     assert b"old" not in after
 
 
-def test_tcpin_takes_one_client_and_the_next_one_when_it_is_silent(ends: ExitStack) -> None:
+def test_tcpin_accepts_a_second_client_only_after_silence(ends: ExitStack) -> None:
     link = opened(f"tcpin:127.0.0.1:{free_port()}", ends)
     place = LOCAL, port(link)
     assert link.receive() == []
     link.send(b"to nobody", None)
     vehicle = ends.enter_context(socket.create_connection(place))
-    vehicle.settimeout(LONG_S)
+    vehicle.settimeout(TIMEOUT_S)
     vehicle.sendall(b"one")
     turns(link, lambda data: data == b"one")
     link.follow("tcp")
     with socket.create_connection(place) as other:
-        other.settimeout(LONG_S)
+        other.settimeout(TIMEOUT_S)
 
         def refused(_: bytes) -> bool:
             vehicle.sendall(b".")
@@ -414,7 +414,7 @@ def test_tcpin_takes_one_client_and_the_next_one_when_it_is_silent(ends: ExitSta
     run_until_it_breaks(link)
 
 
-def test_a_serial_device_that_is_unplugged_and_back(tmp_path: Path, ends: ExitStack) -> None:
+def test_serial_link_reopens_a_replugged_device(tmp_path: Path, ends: ExitStack) -> None:
     """No other program can open the device: two readers would each get a part of the telemetry."""
     device = tmp_path / "ttyACM0"
     other_end, path, unplug = plugged(ends)
@@ -436,7 +436,7 @@ def test_a_serial_device_that_is_unplugged_and_back(tmp_path: Path, ends: ExitSt
 
 
 @pytest.mark.parametrize("kind", ["tcp", "serial", "udp"])
-def test_what_arrives_while_it_waits_is_not_read(kind: str, ends: ExitStack) -> None:
+def test_wait_does_not_read_arriving_data(kind: str, ends: ExitStack) -> None:
     """The supervisor has the same descriptors, and must find the data for which the controller
     waited."""
     link, send = joined(kind, ends)
@@ -451,12 +451,12 @@ def test_what_arrives_while_it_waits_is_not_read(kind: str, ends: ExitStack) -> 
 
     later = threading.Timer(0.1, send_later)
     later.start()
-    link.wait(LONG_S)
+    link.wait(TIMEOUT_S)
     waited_s = clock.monotonic_s() - began_s
     later.join()
     assert 0.09 < waited_s < 0.09 + TURN_S
     assert waiting_bytes(descriptor) == 16
-    link.wait(LONG_S)  # returns at once
+    link.wait(TIMEOUT_S)  # returns at once
     (chunk,) = link.receive()
     assert chunk.data == b"\xfd while it waits"
     assert sent_s[0] - 1e-4 < chunk.arrived_s < clock.monotonic_s()
@@ -484,9 +484,7 @@ def waiting_bytes(descriptor: int) -> int:
     return int.from_bytes(fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)), sys.byteorder)
 
 
-def test_localhost_is_the_same_for_link_and_vehicle(
-    ends: ExitStack, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_localhost_is_resolved_as_ipv4(ends: ExitStack, monkeypatch: pytest.MonkeyPatch) -> None:
     """If /etc/hosts has only ::1 for localhost, glibc answers 127.0.0.1 to a request for IPv4."""
     asked = socket.getaddrinfo
 
@@ -502,11 +500,11 @@ def test_localhost_is_the_same_for_link_and_vehicle(
 
 
 @pytest.mark.skipif(not IPV6, reason="this computer has no IPv6")
-def test_ipv6_addresses(ends: ExitStack) -> None:
+def test_links_support_ipv6_addresses(ends: ExitStack) -> None:
     link = opened(f"udpin:[::1]:{free_port()}", ends)
     assert isinstance(link, UdpLink)
     other = ends.enter_context(socket.socket(socket.AF_INET6, socket.SOCK_DGRAM))
-    other.settimeout(LONG_S)
+    other.settimeout(TIMEOUT_S)
     other.sendto(b"hello", ("::1", port(link)))
     turns(link, lambda data: data == b"hello")
     peer = ("::1", other.getsockname()[1], 0, 0)
@@ -518,15 +516,15 @@ def test_ipv6_addresses(ends: ExitStack) -> None:
         turns(link, lambda _: link.report.ignored)
     assert "1 datagram from [::1]:" in link.report.news()[0]
     server = ends.enter_context(socket.create_server(("::1", 0), family=socket.AF_INET6))
-    server.settimeout(LONG_S)
+    server.settimeout(TIMEOUT_S)
     stream = opened(f"tcp:[::1]:{server.getsockname()[1]}", ends)
     connection = ends.enter_context(server.accept()[0])
-    connection.settimeout(LONG_S)
+    connection.settimeout(TIMEOUT_S)
     stream.send(b"answer", None)
     assert connection.recv(100) == b"answer"
 
 
-def test_a_simulator_without_a_loopback_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_loopback_interface_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without it a socket can be bound, but nothing arrives. This is reported at once."""
 
     class Unreachable(socket.socket):

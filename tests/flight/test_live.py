@@ -51,7 +51,7 @@ def shown_by(show: Callable[[Pair], object], every: int = 1) -> Pair:
 # --- what must not disturb a flight ---------------------------------------------------------------
 
 
-def test_no_client_of_the_live_page_changes_a_setpoint() -> None:
+def test_live_page_clients_do_not_change_setpoints() -> None:
     """Nor does a client affect another one, which sees the flight to its end."""
     with serving() as (process, url):
         address = (urlsplit(url).hostname, urlsplit(url).port)
@@ -88,7 +88,7 @@ def test_no_client_of_the_live_page_changes_a_setpoint() -> None:
     assert max(heights) == pytest.approx(1.0, abs=0.1)
 
 
-def test_what_nobody_reads_delays_nothing_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unread_displays_delay_nothing_and_report_losses(monkeypatch: pytest.MonkeyPatch) -> None:
     """The server is stopped, and the pipe of the JSON lines is full."""
     monkeypatch.setattr("offboard.live.process.PERIOD_S", 0.0)  # gives a thousand snapshots
     monkeypatch.setattr("offboard.live.display.CLOSE_S", 0.2)
@@ -121,7 +121,7 @@ def test_what_nobody_reads_delays_nothing_and_is_told(monkeypatch: pytest.Monkey
     os.close(full)
 
 
-def test_an_address_that_cannot_be_served_is_refused() -> None:
+def test_unusable_live_address_is_refused() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         for unusable, says in (
@@ -208,7 +208,7 @@ def shown() -> Iterator[Shown]:
         yield Shown(pair, objects, files[0].getvalue(), files[1].getvalue(), seen, page)
 
 
-def test_the_live_page_follows_the_flight_in_both_schemes_and_widths(shown: Shown) -> None:
+def test_live_page_is_readable_and_follows_the_flight(shown: Shown) -> None:
     opened = shown.page
     ended = "document.getElementById('phase').innerText.startsWith('disarmed')"
     opened.page.wait_for_function(ended)
@@ -236,7 +236,7 @@ def test_json_lines_are_one_object_each(shown: Shown) -> None:
     assert times[-1] == pytest.approx(shown.pair.time_s, abs=1.0)
 
 
-def test_the_terminal_has_its_lines_and_one_status_in_place(shown: Shown) -> None:
+def test_terminal_prints_each_announcement_and_one_status_line(shown: Shown) -> None:
     plain = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown.terminal).replace("\r", "\n")
     assert plain.splitlines()[0] == shown.pipe.splitlines()[0] == "preparing"
     for sentence in shown.pair.companion.announced:
@@ -248,7 +248,7 @@ def test_the_terminal_has_its_lines_and_one_status_in_place(shown: Shown) -> Non
     assert shown.terminal.rindex(shows_cursor) > shown.terminal.rindex(hides_cursor)
 
 
-def test_snapshots_agree_with_the_wire(shown: Shown) -> None:
+def test_snapshots_agree_with_the_flight(shown: Shown) -> None:
     first, last = shown.seen[0][1], shown.pair.companion.snapshot()
     assert (first.authority, first.reference_ned_m) == ("free", None)
     assert math.isnan(first.position_error_m)
@@ -270,7 +270,7 @@ def test_snapshots_agree_with_the_wire(shown: Shown) -> None:
     assert last.texts[-1] == shown.pair.companion.announced[-1]
 
 
-def test_a_status_leaves_out_what_is_not_known() -> None:
+def test_status_line_omits_unknown_values() -> None:
     now = hover().companion.snapshot()
     assert status(now).strip() == "-- s  connect  unknown"
     shown = {"phase": "track", "position_error_m": 12.3456}
@@ -278,7 +278,7 @@ def test_a_status_leaves_out_what_is_not_known() -> None:
     assert status(now).strip() == "-- s  track  error 12.346 m  unknown  hold: link"
 
 
-def test_the_mode_of_a_pilot_is_shown_with_who_has_authority() -> None:
+def test_snapshot_shows_the_pilots_mode_and_lost_authority() -> None:
     state: Any = uneventful(Phase.TRACK)
     heartbeat(state, armed=True, mode="AUTO.LOITER")
     assert (Snapshot(state).authority, Snapshot(state).mode) == ("lost", "AUTO.LOITER")

@@ -67,7 +67,7 @@ def without_a_text(_: Situation) -> Decision:
         (without_cost, r"controller: TypeError: .*float\(\)"),
     ],
 )
-def test_a_law_that_fails_is_found_before_the_flight(fail: Any, says: str) -> None:
+def test_rehearsal_finds_a_failing_law(fail: Any, says: str) -> None:
     prepared = build(config.load("flight", known_vehicle="px4_sih"))
     law = failing(fail, after=0)(prepared.controller)
     with pytest.raises(DocumentError, match=says):
@@ -75,7 +75,7 @@ def test_a_law_that_fails_is_found_before_the_flight(fail: Any, says: str) -> No
 
 
 @pytest.mark.parametrize("part", ["build", "refusal", "reset"])
-def test_a_law_that_ends_the_program_is_found_before_the_flight(
+def test_rehearsal_finds_a_law_that_exits_the_program(
     part: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def exits(*_: object, **__: object) -> None:
@@ -89,7 +89,7 @@ def test_a_law_that_ends_the_program_is_found_before_the_flight(
         rehearse(build(resolved), keeps_deadline=False)
 
 
-def test_a_law_that_fails_when_it_is_cut_short_is_found_before_the_flight(
+def test_rehearsal_finds_a_law_that_fails_at_its_deadline(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     prepared = build(config.load("flight", known_vehicle="px4_sih"))
@@ -104,7 +104,7 @@ def test_a_law_that_fails_when_it_is_cut_short_is_found_before_the_flight(
         rehearse(prepared, keeps_deadline=True)
 
 
-def test_a_law_that_other_programs_make_late_may_be_flown_later(
+def test_rehearsal_on_a_busy_computer_fails_with_code_3(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Wall time passes between two readings, but no processor time."""
@@ -115,7 +115,7 @@ def test_a_law_that_other_programs_make_late_may_be_flown_later(
     assert late.value.code == 3
 
 
-def test_a_decision_must_be_ready_within_a_period(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rehearsal_refuses_decisions_longer_than_a_period(monkeypatch: pytest.MonkeyPatch) -> None:
     """This holds whatever the deadline is, because a later setpoint is not sent."""
     prepared = build(config.load("flight", assignments=["deadline_s=0.2"], known_vehicle="px4_sih"))
     for name in ("monotonic_s", "thread_s"):
@@ -124,7 +124,7 @@ def test_a_decision_must_be_ready_within_a_period(monkeypatch: pytest.MonkeyPatc
         rehearse(prepared, keeps_deadline=True)
 
 
-def test_parameters_are_requested_until_they_are_answered() -> None:
+def test_parameter_requests_are_repeated_for_2_s() -> None:
     """Request or reply may be lost on the link."""
     reading, known = ParameterReading(), {"MPC_THR_HOVER": 0.5}
     unknown = [each.name for each in PX4.watched_parameters if each.name not in known]
@@ -135,7 +135,7 @@ def test_parameters_are_requested_until_they_are_answered() -> None:
     assert [reading.complete(PX4, each) for each in then] == [False, True]
 
 
-def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
+def test_rehearsal_loads_all_code_of_the_horizon_law(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Otherwise it might be compiled in flight, which takes seconds."""
@@ -160,7 +160,7 @@ def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
     assert loaded == rehearsed
 
 
-def test_the_manifest_is_read_back_or_is_none() -> None:
+def test_logged_configuration_is_read_back_or_none() -> None:
     """The configuration in the log may have any length. If a piece is missing or damaged, None is
     returned."""
     source = random.Random(1)
@@ -178,7 +178,7 @@ def test_the_manifest_is_read_back_or_is_none() -> None:
         assert joined_configuration(payloads) is None
 
 
-def test_a_message_that_cannot_be_encoded_does_not_stop_the_later_ones() -> None:
+def test_unencodable_message_does_not_block_later_ones() -> None:
     """The message is a command without a vehicle. After the error the loop requests a landing."""
     flight = hover().companion
     outbox.send(flight, CommandLong.arm())

@@ -234,7 +234,7 @@ def event_of(row: Transition) -> Setup:
 
 
 @BOTH
-def test_every_row_is_taken_when_its_condition_holds(service: ServiceOptions | None) -> None:
+def test_every_phase_row_is_taken_when_its_condition_holds(service: ServiceOptions | None) -> None:
     """This holds in each phase of the row, so that no row above takes all of its cases. The reason
     must be complete."""
     for row in table(service):
@@ -247,7 +247,7 @@ def test_every_row_is_taken_when_its_condition_holds(service: ServiceOptions | N
             assert "{" not in row.why(flight) + row.cause.format(flight=flight)
 
 
-def test_the_start_is_reached_by_a_vehicle_that_is_seen_to_rest_there() -> None:
+def test_start_is_reached_only_at_rest() -> None:
     for there, changed in (
         (True, _set()),
         (False, lambda flight: setattr(flight.vehicle, "position", None)),
@@ -260,7 +260,7 @@ def test_the_start_is_reached_by_a_vehicle_that_is_seen_to_rest_there() -> None:
         assert flying.at_start(flight) is there
 
 
-def test_a_later_start_does_not_lower_the_hover_thrust_of_the_first() -> None:
+def test_second_start_keeps_the_first_hover_thrust() -> None:
     flight = uneventful(Phase.CLIMB)
     flight.identification = None
     for flight.phase, thrust in ((Phase.CLIMB, 0.4), (Phase.CLIMB, 0.19)):
@@ -272,7 +272,7 @@ def test_a_later_start_does_not_lower_the_hover_thrust_of_the_first() -> None:
     assert failsafe.low_thrust(flight)
 
 
-def test_every_wait_is_limited() -> None:
+def test_every_phase_has_a_time_limit() -> None:
     for phase in {phase for row in table() for phase in row.phases}:
         flight = uneventful(phase)
         later = _track_for(1e4) if phase in ON_TRACK else _since(1e4)
@@ -284,7 +284,7 @@ def test_every_wait_is_limited() -> None:
         assert next_row(flight) is not None
 
 
-def test_the_service_waits_for_ever() -> None:
+def test_waiting_phases_of_the_service_have_no_time_limit() -> None:
     for service in SERVICES.values():
         for phase in (Phase.CONNECT, Phase.HEALTH, Phase.STANDBY, Phase.PAUSE):
             silent = phase in (Phase.CONNECT, Phase.HEALTH)
@@ -306,7 +306,7 @@ def test_the_service_waits_for_ever() -> None:
     assert targets == {"hold": None, "land": Phase.LAND, "repeat": Phase.CLIMB}
 
 
-def test_every_phase_but_the_ends_has_rows_and_each_leads_to_a_later_one() -> None:
+def test_phase_rows_lead_only_to_later_phases() -> None:
     """In the service only the first statement holds, because it flies again; and only a request on
     the ground leads to the phases that arm."""
     order = {phase: index for index, phase in enumerate(Phase)}
@@ -334,7 +334,7 @@ def test_every_abnormal_end_has_an_exit_code() -> None:
     assert {row.exit_code for row in rows} == {None, ExitCode.REFUSED, ExitCode.ABORTED}
 
 
-def test_what_prevents_a_take_over_prevents_each_kind_of_it() -> None:
+def test_obstacles_prevent_every_kind_of_take_over() -> None:
     in_failsafe = partial(heartbeat, armed=True, status=5)
     prevented = (EVENTS[each] for each in ("other_sender", "mode_unknown", "silent", "blind"))
     for prevents in (in_failsafe, *prevented):
@@ -347,7 +347,7 @@ def test_what_prevents_a_take_over_prevents_each_kind_of_it() -> None:
             assert not condition(flight), name
 
 
-def test_reasons_against_an_engagement_are_apart() -> None:
+def test_reasons_against_engagement_are_separated_by_semicolons() -> None:
     flight = uneventful(Phase.STANDBY, SERVICES["hold"])
     for name in ("engaged_but_unfit", "refused"):
         EVENTS[name](flight)
@@ -355,7 +355,7 @@ def test_reasons_against_an_engagement_are_apart() -> None:
 
 
 @BOTH
-def test_no_way_out_of_the_air_leaves_the_vehicle_unasked(service: ServiceOptions | None) -> None:
+def test_every_exit_in_flight_requests_hold_or_land(service: ServiceOptions | None) -> None:
     """Each row that ends a flight in the air belongs or leads to a phase that asks for hold or
     land, unless the vehicle is disarmed or not ours any more. A flight that ends just after the
     vehicle became ours in the air leads to such a phase, too."""
@@ -373,7 +373,7 @@ def test_no_way_out_of_the_air_leaves_the_vehicle_unasked(service: ServiceOption
             assert taken.target in IN_THE_AIR
 
 
-def test_a_vehicle_that_does_not_climb_is_told_of_settings_that_it_has() -> None:
+def test_hint_for_a_slow_climb_names_existing_settings() -> None:
     """The hint names hover_thrust if the flight shows another value, else the bandwidth. There is
     no hint for a law without bandwidth."""
     bandwidth = "; is the vehicle fast enough for controller.bandwidth_radps?"
@@ -390,7 +390,7 @@ def test_a_vehicle_that_does_not_climb_is_told_of_settings_that_it_has() -> None
         assert flying.too_late_at_start(flight).partition("late")[2][: len(hint) or None] == hint
 
 
-def test_a_vehicle_that_reboots_as_it_arms_counts_as_unheard_from_then_on() -> None:
+def test_reboot_while_arming_starts_the_silence_time() -> None:
     """It counts from the reboot, not as never heard, so that a landing at once waits for its
     HEARTBEAT."""
     flight = uneventful(Phase.ARM)
@@ -401,7 +401,7 @@ def test_a_vehicle_that_reboots_as_it_arms_counts_as_unheard_from_then_on() -> N
     assert flight.unreached_s == pytest.approx(4.0)
 
 
-def test_only_a_heartbeat_newer_than_the_acceptance_shows_a_disarming() -> None:
+def test_disarming_needs_a_heartbeat_newer_than_the_acceptance() -> None:
     """On a lossy link the acceptance of arming may arrive late, and the next HEARTBEAT be lost."""
     flight = uneventful(Phase.ARM)
     flight.vehicle.now_s = NOW_S + 0.1
@@ -414,7 +414,7 @@ def test_only_a_heartbeat_newer_than_the_acceptance_shows_a_disarming() -> None:
     assert row.target is Phase.STAND_DOWN
 
 
-def test_the_tables_of_the_readme_are_those_of_the_code() -> None:
+def test_readme_tables_match_the_code() -> None:
     text = README.read_text(encoding="utf-8")
     assert text.count("\n| position error |") == text.count("\n| rebooted in flight |") == 1
     assert text == with_tables(text)

@@ -67,7 +67,9 @@ def words(commands: list[tuple[float, int]]) -> list[int]:
 
 @FIRMWARES
 @pytest.mark.parametrize("answered_s", [0.05, 0.55], ids=["at once", "the second request"])
-def test_hold_at_once_then_land_until_disarmed(dialect: Dialect, answered_s: float) -> None:
+def test_recovery_requests_hold_then_land_until_disarmed(
+    dialect: Dialect, answered_s: float
+) -> None:
     """Also if the first COMMAND_ACK is missing; with a real PX4 the controller had read it."""
     commands, ended = asked(
         dialect,
@@ -86,7 +88,7 @@ def test_hold_at_once_then_land_until_disarmed(dialect: Dialect, answered_s: flo
 
 
 @FIRMWARES
-def test_only_what_is_ours_is_asked_for_more(dialect: Dialect) -> None:
+def test_recovery_commands_only_a_vehicle_in_our_modes(dialect: Dialect) -> None:
     """A hold mode that the vehicle has not acknowledged, or showed before, was chosen by somebody
     else. A hold that the controller had requested is ours."""
     holds = beats(dialect.hold_mode, 0.5, 20.5)
@@ -103,7 +105,7 @@ def test_only_what_is_ours_is_asked_for_more(dialect: Dialect) -> None:
 
 
 @FIRMWARES
-def test_a_landing_goes_on(dialect: Dialect) -> None:
+def test_recovery_continues_a_landing(dialect: Dialect) -> None:
     """Regression: a landing was interrupted by 5 s of hold, and a pilot's hold was taken for the
     answer."""
     landing = replace(OURS, landing=True)
@@ -117,7 +119,7 @@ def test_a_landing_goes_on(dialect: Dialect) -> None:
 
 
 @FIRMWARES
-def test_a_vehicle_that_is_not_heard_or_does_not_obey(dialect: Dialect) -> None:
+def test_recovery_limits_requests_to_an_unresponsive_vehicle(dialect: Dialect) -> None:
     """If nothing at all is heard, three requests are sent; else one per report, at last to land."""
     commands, ended = asked(dialect)
     assert (words(commands), ended) == ([HOLD] * 3, TOO_LONG)
@@ -130,7 +132,7 @@ def test_a_vehicle_that_is_not_heard_or_does_not_obey(dialect: Dialect) -> None:
 
 @FIRMWARES
 @pytest.mark.parametrize("pilot_s", [0.2, 3.5, 12.5])
-def test_a_pilot_is_never_overridden(dialect: Dialect, pilot_s: float) -> None:
+def test_recovery_never_overrides_a_pilot(dialect: Dialect, pilot_s: float) -> None:
     """Nothing is requested after the first report of the pilot's mode: before hold, in hold, and in
     the landing."""
     mode = {"px4": "POSCTL", "ardupilot": "LOITER"}[dialect.name]
@@ -141,22 +143,22 @@ def test_a_pilot_is_never_overridden(dialect: Dialect, pilot_s: float) -> None:
     assert all(at_s <= pilot_s for at_s, _ in commands)
 
 
-HOLDS = [(0.5 + 0.5 * n, ModeReport(PX4.hold_mode)) for n in range(22)]
-IN_LANDING = [*HOLDS[:10], *((5.9 + 0.5 * n, ModeReport(PX4.land_mode)) for n in range(3))]
+HOLD_REPORTS = [(0.5 + 0.5 * n, ModeReport(PX4.hold_mode)) for n in range(22)]
+IN_LANDING = [*HOLD_REPORTS[:10], *((5.9 + 0.5 * n, ModeReport(PX4.land_mode)) for n in range(3))]
 
 
 @pytest.mark.parametrize(
     ("commands", "reports"),
     [
         # another mode between our request and its effect, which the vehicle has acknowledged
-        *(([HOLD], [(s, ModeReport("POSCTL")), *HOLDS]) for s in (0.01, 0.31, 3.1)),
+        *(([HOLD], [(s, ModeReport("POSCTL")), *HOLD_REPORTS]) for s in (0.01, 0.31, 3.1)),
         # hold that arrived before the request left, and was read after it
-        ([HOLD], [(-0.01, ModeReport(PX4.hold_mode)), *HOLDS]),
+        ([HOLD], [(-0.01, ModeReport(PX4.hold_mode)), *HOLD_REPORTS]),
         # hold after the landing mode
-        ([HOLD, LAND], [*IN_LANDING, *((6.92 + 0.1 * n, HOLDS[0][1]) for n in range(51))]),
+        ([HOLD, LAND], [*IN_LANDING, *((6.92 + 0.1 * n, HOLD_REPORTS[0][1]) for n in range(51))]),
     ],
 )
-def test_a_mode_that_was_not_asked_for_is_final(commands: list[int], reports: list[Timed]) -> None:
+def test_unrequested_mode_ends_the_recovery(commands: list[int], reports: list[Timed]) -> None:
     """It is final whatever is reported afterwards."""
     beat = [(12.1, Heartbeat(reports[-1][1].mode, True, 4, 2))]  # type: ignore[attr-defined]
     done, ended = asked(PX4, ACCEPTED, *reports, *beat, shown=PX4.engage_mode)
@@ -164,7 +166,7 @@ def test_a_mode_that_was_not_asked_for_is_final(commands: list[int], reports: li
     assert ended.startswith("the vehicle shows ")
 
 
-def test_the_failsafe_for_missing_setpoints_may_act_a_little_early() -> None:
+def test_setpoint_loss_failsafe_may_act_slightly_early() -> None:
     """The newest setpoint was sent before the controller's newest beat, and may have been lost."""
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": POSCTL})
     for at_s, end in ((0.6, "the vehicle shows POSCTL"), (0.8, DISARMED)):
@@ -174,7 +176,7 @@ def test_the_failsafe_for_missing_setpoints_may_act_a_little_early() -> None:
         assert ended.startswith(end)
 
 
-def test_from_hold_even_the_mode_of_that_failsafe_is_a_pilots_choice() -> None:
+def test_failsafe_mode_after_hold_is_a_pilots_choice() -> None:
     """The controller has requested hold. HEARTBEAT shows another failsafe, such as an empty
     battery."""
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": POSCTL})
@@ -185,13 +187,13 @@ def test_from_hold_even_the_mode_of_that_failsafe_is_a_pilots_choice() -> None:
     assert commands == []
 
 
-def test_leaving_the_landing_mode_as_it_disarms_is_no_choice() -> None:
+def test_mode_change_while_disarming_is_not_a_pilots_choice() -> None:
     left = [(7.5, ModeReport(PX4.hold_mode)), *beats(PX4.hold_mode, 12.1, 12.1, armed=False)]
     commands, ended = asked(PX4, ACCEPTED, *IN_LANDING, *left, shown=PX4.engage_mode)
     assert (words(commands), ended) == ([HOLD, LAND], DISARMED)
 
 
-def test_a_refusal_is_kept_to_be_said() -> None:
+def test_refused_command_is_reported() -> None:
     recovery = Recovery(PX4, OURS, 0.0, 0.0)
     for result, said in (("ACCEPTED", []), ("DENIED", ["the vehicle answers DENIED"])):
         recovery.see(CommandAck(HOLD, result), 0.1)
@@ -264,9 +266,7 @@ def recovered(
     ("after_s", "fallback"),
     [(-0.4, POSCTL), (-0.004, POSCTL), (0.0, LOITER), (0.004, RETURN), (0.02, LANDS)],
 )
-def test_before_the_failsafe_and_in_a_race_with_it_it_is_landed(
-    after_s: float, fallback: int
-) -> None:
+def test_vehicle_is_landed_just_before_or_after_its_failsafe(after_s: float, fallback: int) -> None:
     """The supervisor acts `after_s` after the failsafe; by itself it acts 0.4 s before. Regression:
     it took the mode of the failsafe for a pilot's, and gave up."""
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": fallback})
@@ -276,7 +276,7 @@ def test_before_the_failsafe_and_in_a_race_with_it_it_is_landed(
 
 
 @pytest.mark.parametrize(("fallback", "silent_s"), [(POSCTL, 1.2), (LOITER, 0.6)])
-def test_in_the_failsafe_it_is_watched_and_landed_if_it_does_not(
+def test_vehicle_in_its_failsafe_is_landed_unless_it_descends(
     fallback: int, silent_s: float
 ) -> None:
     """Every request to hold is lost. In POSCTL without sticks the vehicle sinks by itself."""
@@ -289,7 +289,7 @@ def test_in_the_failsafe_it_is_watched_and_landed_if_it_does_not(
 
 
 @pytest.mark.parametrize(("mode", "pilot_s"), [("POSCTL", 0.5), ("POSCTL", 3.0), ("ALTCTL", 1.3)])
-def test_a_pilots_choice_is_final_before_the_failsafe_and_in_it(mode: str, pilot_s: float) -> None:
+def test_pilots_mode_is_final_before_and_in_the_failsafe(mode: str, pilot_s: float) -> None:
     """POSCTL is also the mode of the failsafe, but HEARTBEAT shows no failsafe once a pilot has
     chosen it. No command arrives."""
     result = recovered(POSCTL, 1.2, arrives=lambda command: False, pilot=(pilot_s, mode))

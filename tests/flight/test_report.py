@@ -79,7 +79,7 @@ def opened(flown: Flown) -> Iterator[Opened]:
         yield opened
 
 
-def test_the_page_is_readable_in_both_schemes_and_widths(opened: Opened) -> None:
+def test_report_is_readable_in_both_schemes_and_widths(opened: Opened) -> None:
     """It begins with the verdict."""
     for width, scheme in ((400, "dark"), (1280, "light")):
         opened.resize(width)
@@ -95,7 +95,7 @@ def test_the_page_is_readable_in_both_schemes_and_widths(opened: Opened) -> None
     assert "✗ not completed (mode change): the vehicle left OFFBOARD for AUTO.LOITER" in shown[1:4]
 
 
-def test_the_curves_are_those_of_the_score(opened: Opened, flown: Flown) -> None:
+def test_report_curves_agree_with_score_and_setpoints(opened: Opened, flown: Flown) -> None:
     begun = {phase: time_s for time_s, phase in flown.pair.phases}
     times, errors = map(np.array, opened.page.evaluate(CURVE, ["tracking", "estimated"]))
     tracked = (times >= begun[Phase.TRACK]) & (times <= begun[Phase.HOVER])
@@ -113,7 +113,7 @@ def test_linked_figures_zoom_together(opened: Opened) -> None:
     opened.page.wait_for_function(f"{ranges}.every(([low, high]) => low === 3 && high === 7)")
 
 
-def test_the_path_is_no_mirror_image(recorded: Flight) -> None:
+def test_3d_path_is_drawn_east_north_up(recorded: Flight) -> None:
     """The axes of a scene are right-handed: east, north, up."""
     (curve,) = figures([recorded])["path"].drawing.data
     north, east, down = recorded.history.position["position_ned_m"][[0, -1]].T
@@ -122,7 +122,7 @@ def test_the_path_is_no_mirror_image(recorded: Flight) -> None:
     assert figures([recorded])["tracking"].caption == ""  # the recording has no reference
 
 
-def test_bands_are_the_phases_that_were_flown(flown: Flown) -> None:
+def test_timeline_bands_are_the_flown_phases(flown: Flown) -> None:
     phases = [band for band in bands(flown.flight) if band.row == "phase"]
     shown = [band for band in phases if band.end_s > band.begin_s or band is phases[-1]]
     begun = {phase.value: time_s for time_s, phase in flown.pair.phases}
@@ -142,7 +142,7 @@ def of_phases(flight: Flight, *names: str) -> Flight:
     return replace(flight, history=replace(flight.history, phases=phases))
 
 
-def test_a_pause_makes_two_bands_and_giving_back_is_no_failsafe(flown: Flown) -> None:
+def test_pause_splits_track_band_and_hand_back_is_no_failsafe(flown: Flown) -> None:
     begun_s = flown.flight.begin_s
     phases = ("ready", "track", "pause", "track", "hover", "hand back", "yielded")
     paused = of_phases(flown.flight, *phases)
@@ -154,7 +154,7 @@ def test_a_pause_makes_two_bands_and_giving_back_is_no_failsafe(flown: Flown) ->
         assert not [mark for mark in marks(flight) if mark.row == "failsafe"]
 
 
-def test_the_track_ends_where_the_supervisor_takes_over(flown: Flown) -> None:
+def test_track_band_ends_where_the_supervisor_takes_over(flown: Flown) -> None:
     tracking, begun_s = of_phases(flown.flight, "ready", "track"), flown.flight.begin_s
     said = [
         Event(begun_s + 5.0 + number, "offboard", f"supervisor: {what}", cause="supervisor")
@@ -168,7 +168,7 @@ def test_the_track_ends_where_the_supervisor_takes_over(flown: Flown) -> None:
     assert "✗</span> not completed: supervisor: taking over</p>" in page([killed])
 
 
-def test_the_metrics_on_the_page_are_those_of_the_score(flown: Flown, recorded: Flight) -> None:
+def test_report_metrics_agree_with_the_score(flown: Flown, recorded: Flight) -> None:
     """This also holds for several flights on one page."""
     shown = {name: values[0] for name, values in report_page.rows([flown.flight]).items()}
     finite = {name: v for name, v in flown.score.metrics().items() if math.isfinite(v)}
@@ -187,7 +187,7 @@ def of_kinds(log: Path, without: set[int]) -> bytes:
     )
 
 
-def test_a_log_of_another_program_gives_what_it_holds(tmp_path: Path, recorded: Flight) -> None:
+def test_report_of_a_foreign_log_shows_what_it_contains(tmp_path: Path, recorded: Flight) -> None:
     bare = tmp_path / "bare.tlog"
     bare.write_bytes(of_kinds(PX4, {31, 32, 82, 83, 84}))  # ATTITUDE, GLOBAL_POSITION_INT
     whole, flight = recorded, read(bare)
@@ -213,9 +213,7 @@ def test_a_log_of_another_program_gives_what_it_holds(tmp_path: Path, recorded: 
     assert "31 datagrams of others" in shown
 
 
-def test_a_flight_of_ours_is_not_shown_in_the_frame_of_another_message(
-    tmp_path: Path, flown: Flown
-) -> None:
+def test_global_position_does_not_replace_our_local_position(tmp_path: Path, flown: Flown) -> None:
     """Its reference has the origin of LOCAL_POSITION_NED; GLOBAL_POSITION_INT has another one."""
     bare = tmp_path / "bare.tlog"
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -231,7 +229,7 @@ def test_a_flight_of_ours_is_not_shown_in_the_frame_of_another_message(
     ("origin", "moved", "north_m"),
     [(True, False, 111.195), (False, False, 0.0), (True, True, 111.195)],
 )
-def test_a_home_position_is_the_origin_only_without_another(
+def test_home_position_is_the_origin_only_without_global_origin(
     tmp_path: Path, origin: bool, moved: bool, north_m: float
 ) -> None:
     """ArduCopter's HOME_POSITION has zeros as local position wherever home is. 0.001 degrees of
@@ -259,9 +257,7 @@ def test_a_home_position_is_the_origin_only_without_another(
     assert row["position_ned_m"] == pytest.approx([north_m, 0.0, 0.0], abs=0.01)
 
 
-def test_a_damaged_log_is_shown_with_the_place_of_the_damage(
-    tmp_path: Path, recorded: Flight
-) -> None:
+def test_report_names_the_place_of_log_damage(tmp_path: Path, recorded: Flight) -> None:
     data = bytearray(PX4.read_bytes())
     at = len(data) // 2
     data[at : at + 500] = bytes(500)
@@ -315,7 +311,7 @@ def invoke(*arguments: object) -> tuple[int, str]:
     return answer.exit_code, str(said)
 
 
-def test_the_command_replaces_nothing_and_refuses_what_is_no_log(
+def test_report_command_overwrites_nothing_and_refuses_non_logs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = tmp_path / "x.tlog"

@@ -125,7 +125,7 @@ def flies_and_lands(pair: Pair) -> None:
     landed(pair)
 
 
-def heavy() -> Pair:
+def believed_heavy() -> Pair:
     """The vehicle file has the hover thrust of an earlier flight with a load, which is gone now."""
     file = px4.hop().companion.model
     return px4.hop(believed=file.model_copy(update={"hover_thrust": 0.93}))
@@ -196,13 +196,13 @@ ROWS = {
         fly=overloaded_twice, failsafes=["thrust reserve"],
     ),
     # the result was once "flown and landed", after 20 s on the ground
-    "it has fallen to the ground": ends(
+    "the vehicle has fallen to the ground": ends(
         r"the vehicle stands on the ground, [0-9.]+ m below the reference", landed,
         soon(Phase.TRACK, 4.0), fly=copter.hover, at=tracking(too_heavy), failsafes=["ground"],
         ended_by="ground contact",
     ),
     # the result was once "flown and landed", because the estimated height was 3 m
-    "it has sunk to the ground, and its estimate has not": ends(
+    "the vehicle has sunk to the ground, but its estimate has not": ends(
         r"the vehicle needs [0-9]+ % of its thrust instead of [0-9]+ %: it stands on", landed,
         fly=partial(copter.hover, "reference.duration_s=10.0"),
         at=tracking(lambda pair: pair.instance.autopilot.plant.reset_estimate((0.0, 0.0, -1.9))),
@@ -213,7 +213,7 @@ ROWS = {
         "2 m above and 0 m from the take-off point", landed, fly=partial(px4.hop, HIGH),
         limits={"ceiling_m": 2.0}, failsafes=["volume"], top_m=3.25,
     ),
-    "disarmed, it says, and flies": aborts(
+    "the vehicle reports disarmed while it flies": aborts(
         Phase.FAILED, "the vehicle disarmed ", flies_and_lands, fly=px4.hover, armed=True,
         at=tracking(downlink(disarmed())),
     ),
@@ -260,12 +260,12 @@ ROWS = {
     "a failsafe": taken(
         px4, early("empty_battery"), ".*; a failsafe of the vehicle has it", ended_by="failsafe"
     ),
-    "it is in a failsafe": of_another(copter, "in_failsafe", FAILSAFE),
+    "the vehicle is in a failsafe": of_another(copter, "in_failsafe", FAILSAFE),
     "another offboard tracks": of_another(px4, another_companion(setpoint_rate_hz=0), IDS),
     "another program streams": of_another(px4, scenario_of(STREAMED, start=OFFBOARD), ENGAGED),
-    "it is engaged already": of_another(copter, scenario_of(start=GUIDED), ENGAGED),
+    "the vehicle is engaged already": of_another(copter, scenario_of(start=GUIDED), ENGAGED),
     # flights that go on
-    "a load that is only believed": flies(fly=heavy, failsafes=()),
+    "a load that only the vehicle file has": flies(fly=believed_heavy, failsafes=()),
     "one wrong heartbeat in track": one_wrong_heartbeat(px4, Phase.TRACK),
     "one wrong heartbeat in the take-off": one_wrong_heartbeat(copter, Phase.TAKEOFF),
     "one wrong heartbeat in the landing": one_wrong_heartbeat(px4, Phase.LAND),
@@ -274,14 +274,14 @@ ROWS = {
         fly=px4.lap, aloft=False, scenario="all_together", seed=1, deadline_s=0.05,
         believed=simulated.vehicle("neutral"), learning=IdentifySettings(),
     ),
-    "stopped while it lands": flies(
+    "stop while landing": flies(
         says_that_it_lands, fly=copter.hover, at=then(Phase.LAND, 0.3, stop), failsafes=()
     ),
     "no GPS from the beginning, by motion capture": flies(
         fly=px4.hover, firmware=WITH_GPS, scenario=NO_GPS, failsafes=()
     ),
     # started by mistake on another port, with our ids; it is refused itself, as in other rows
-    "a second flight that waits": flies(
+    "another offboard waits on the link": flies(
         says_who_is_on_the_link, fly=copter.hover, scenario=WAITS, failsafes=()
     ),
     # regression: its HEARTBEAT, forwarded by a router, was taken for a second controller of ours
@@ -295,12 +295,12 @@ ROWS = {
 @pytest.mark.parametrize(
     "title", [pytest.param(each, marks=[pytest.mark.slow] * (each == RARE)) for each in ROWS]
 )
-def test_flight(title: str) -> None:
+def test_flight_with_a_hazard_ends_as_expected(title: str) -> None:
     judged(ROWS[title])
 
 
 @pytest.mark.parametrize(("scenario", "on"), [("landed_wrong", px4), ("landed_lost", copter)])
-def test_in_the_air_it_never_falls(scenario: str, on: Vehicle) -> None:
+def test_wrong_land_detector_causes_no_fall(scenario: str, on: Vehicle) -> None:
     """The land detector wrongly reports the ground. Thrust stays above a third of hover thrust, and
     the vehicle never sinks fast."""
     start = Start(height_m=5.0)  # instead of 10 m and 18 m
@@ -313,7 +313,7 @@ def test_in_the_air_it_never_falls(scenario: str, on: Vehicle) -> None:
     assert min(setpoint.thrust for _, _, setpoint in pair.setpoints) > least - 1e-6
 
 
-def test_the_vehicle_does_not_step_with_its_estimate() -> None:
+def test_estimate_reset_moves_the_vehicle_slowly() -> None:
     """After a reset of the estimate by 1.5 m in a hover, the vehicle moves to the reference in the
     new frame at up to 0.5 m/s."""
     pair = copter.hover("reference.duration_s=8.0", scenario=scenario_of(jump(0.0, 1.5, 0.0)))
@@ -331,7 +331,7 @@ IN_LANDING = jump(0.0, 0.0, -1.9, after="landing", at_s=0.5)
 
 
 @pytest.mark.parametrize("resets", [[IN_TRACK], [IN_TAKEOFF, IN_LANDING]])
-def test_resets_of_the_estimate_move_its_place_and_the_ground(resets: list[dict[str, Any]]) -> None:
+def test_estimate_resets_shift_reference_and_ground_height(resets: list[dict[str, Any]]) -> None:
     """Regression: after a reset by 1.5 m before lift-off it flew at once to the old place, 1.5 m
     away. Later the estimated height jumps up, and with it the height of the ground, for the flight
     and for the score."""
@@ -342,7 +342,7 @@ def test_resets_of_the_estimate_move_its_place_and_the_ground(resets: list[dict[
 
 
 @BOTH
-def test_while_another_address_sends_with_its_ids_a_vehicle_is_not_armed(on: Vehicle) -> None:
+def test_vehicle_is_not_armed_while_its_ids_are_duplicated(on: Vehicle) -> None:
     """The first one heard was once flown, whichever was meant. Now it flies once the other has
     gone."""
     pair, twin = on.hop(), on.hop(seed=8).instance
@@ -358,7 +358,7 @@ def test_while_another_address_sends_with_its_ids_a_vehicle_is_not_armed(on: Veh
     assert begun_s(pair, Phase.ARM) > 20.0 + HEARD_S - 1.1
 
 
-def test_another_address_that_sends_with_its_ids_before_it_is_armed_ends_the_start() -> None:
+def test_duplicate_ids_before_arming_end_the_start() -> None:
     pair, twin = px4.hop(), px4.hop(seed=8).instance
 
     def beside(_: float, datagrams: Bytes) -> Bytes:
@@ -373,7 +373,7 @@ def test_another_address_that_sends_with_its_ids_before_it_is_armed_ends_the_sta
 
 
 @BOTH
-def test_of_two_vehicles_with_the_same_ids_on_one_radio_none_is_armed(on: Vehicle) -> None:
+def test_vehicles_sharing_ids_on_one_radio_are_not_armed(on: Vehicle) -> None:
     """Both follow what is sent. Regression: the other one was flown, too, by setpoints that were
     not made for it."""
     pair, twin = on.hop(), on.hop(seed=8).instance

@@ -58,7 +58,7 @@ def oldest_s(pair: Pair) -> float:
     ("scenario", "on"),
     [("later_and_later", copter), pytest.param("link_saturates", px4, marks=pytest.mark.slow)],
 )
-def test_a_link_that_becomes_late_ends_in_hold_and_landing(scenario: str, on: Vehicle) -> None:
+def test_growing_link_delay_ends_in_hold_and_landing(scenario: str, on: Vehicle) -> None:
     traffic = {"firmware": OBEDIENT} if on is px4 else {}
     pair = on.lap(
         HIGH, "reference.laps=2", scenario=early(scenario), deadline_s=DEADLINE_S, **traffic
@@ -95,7 +95,7 @@ STUCK = {
 
 
 @pytest.mark.parametrize("case", STUCK)
-def test_telemetry_that_repeats_itself_is_none(case: str) -> None:
+def test_repeated_telemetry_counts_as_missing(case: str) -> None:
     """Values repeat with new stamps, until the end. Thrust is twice that of the vehicle file. The
     vehicle climbs at most 3 m above the last correct height, and is never disarmed in the air."""
     on, message, fields, (after, at_s), says = STUCK[case]
@@ -141,9 +141,7 @@ def slow_law(clock: HostClock, seconds: float, after: int = 0) -> Callable[[Any]
 
 
 @pytest.mark.parametrize(("seconds", "on"), [(0.08, px4), (0.15, copter)])
-def test_a_law_that_needs_most_of_the_period_is_flown_and_a_slower_one_landed(
-    seconds: float, on: Vehicle
-) -> None:
+def test_law_slower_than_the_period_ends_in_a_landing(seconds: float, on: Vehicle) -> None:
     clock = HostClock()
     law = slow_law(clock, seconds, after=59)
     pair = on.lap(wrap=law, deadline_s=DEADLINE_S, clock=clock)
@@ -172,7 +170,7 @@ def test_a_law_that_needs_most_of_the_period_is_flown_and_a_slower_one_landed(
         ),
     ],
 )
-def test_a_slow_prediction_is_no_failure_of_the_law(
+def test_slow_prediction_is_not_blamed_on_the_law(
     slow_s: float, says: str, cause: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The time is exceeded before the law is called, which then decides at once."""
@@ -184,7 +182,7 @@ def test_a_slow_prediction_is_no_failure_of_the_law(
     assert not pair.armed
 
 
-def test_no_setpoint_waits_for_the_identification(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_identification_does_not_delay_setpoints(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each piece of the identification takes 60 ms, and a decision 2 ms."""
     clock = HostClock()
     monkeypatch.setattr(Learner, "learn", slowly(Learner.learn, clock, 0.06))
@@ -197,7 +195,7 @@ def test_no_setpoint_waits_for_the_identification(monkeypatch: pytest.MonkeyPatc
     assert result.missed_ticks == 0
 
 
-def test_at_lift_off_no_gain_is_computed_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gains_are_computed_before_lift_off(monkeypatch: pytest.MonkeyPatch) -> None:
     """On the ground a turn may take long. No other test uses this drag, so that no gain of this
     vehicle has been computed before."""
     drag = {"drag_translation_npmps": (0.777, 0.777, 0.777)}
@@ -237,7 +235,7 @@ def paused(
 
 
 @pytest.mark.parametrize(("seconds", "on"), [(0.9, px4), (3.0, copter)])
-def test_after_a_pause_one_setpoint_leaves(seconds: float, on: Vehicle) -> None:
+def test_one_setpoint_is_sent_after_a_pause(seconds: float, on: Vehicle) -> None:
     """The setpoint is decided from the newest telemetry. The pause is announced and counted. There
     is no supervisor here; it would have taken over in the pause of 3 s."""
     pair, watch, end_s = paused(on, seconds)
@@ -256,7 +254,7 @@ def test_after_a_pause_one_setpoint_leaves(seconds: float, on: Vehicle) -> None:
         assert busy.endswith(f" ticks were skipped, pauses up to {seconds:.2f} s")
 
 
-def test_what_happens_often_is_told_once_a_second_and_summed_up() -> None:
+def test_frequent_announcements_are_summed_once_a_second() -> None:
     """Messages are dropped ten times within 1.3 s, and this process pauses three times."""
     pair = px4.hover("reference.duration_s=5", deadline_s=DEADLINE_S)
     for number in range(10):
@@ -275,14 +273,14 @@ def test_what_happens_often_is_told_once_a_second_and_summed_up() -> None:
     assert "(the longest of 2)" in pauses[1]
 
 
-def test_after_three_seconds_a_px4_in_its_failsafe_is_landed_without_a_setpoint() -> None:
+def test_px4_in_its_failsafe_gets_no_setpoint_after_a_pause() -> None:
     says = ".*the vehicle's own failsafe flies it, in POSCTL"
     pair, _, end_s = paused(px4, 3.0, ExitCode.ABORTED, says)
     assert pair.went_through(Phase.DISARMED)
     assert [at_s for at_s, _, _ in pair.setpoints if at_s > end_s - 3.0 + 0.01] == []
 
 
-def test_setpoints_that_were_dropped_between_two_pauses_are_missing() -> None:
+def test_setpoints_dropped_between_pauses_count_as_missing() -> None:
     """After pauses of 0.5 and 0.55 s, 50 ms apart, PX4 holds by its own failsafe, and is landed
     from there."""
     pair = px4.lap("reference.run_in_s=4.0", deadline_s=DEADLINE_S)
@@ -314,7 +312,7 @@ def test_setpoints_that_were_dropped_between_two_pauses_are_missing() -> None:
     assert not pair.armed
 
 
-def test_after_a_pause_a_report_of_the_mode_is_awaited() -> None:
+def test_mode_report_is_awaited_after_a_pause() -> None:
     """A PX4 sends only HEARTBEAT, at 1 Hz, and receives no request for another one. A HEARTBEAT
     from before the pause is too old: 0.6 s are allowed."""
     beats_s: list[float] = []
@@ -339,7 +337,7 @@ def test_after_a_pause_a_report_of_the_mode_is_awaited() -> None:
     assert watch.error_m < 0.3
 
 
-def test_after_a_pause_telemetry_of_a_stream_is_not_late() -> None:
+def test_stream_telemetry_is_not_late_after_a_pause() -> None:
     """Bytes of a stream that are read after a pause may have arrived at any time since the turn
     before."""
     pair = px4.hover(at=[(in_phase(Phase.TRACK, 0.5), lambda pair: pair.pause(0.45))])

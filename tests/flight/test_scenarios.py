@@ -47,7 +47,7 @@ from simulator.firmware.ardupilot import ARDUPILOT
 
 TAKEOFF = 22  # MAV_CMD
 STILL_ARMED = "it has stood still for 15 s and is armed: its land detector reports that it flies"
-EARLIER = {"fault": "clock_jump", "jump_s": -3, "after": "landing", "at_s": 0.5}
+CLOCK_SET_BACK = {"fault": "clock_jump", "jump_s": -3, "after": "landing", "at_s": 0.5}
 
 
 def late_both_ways(pair: Pair) -> None:
@@ -345,7 +345,7 @@ def set_parameter(pair: Pair) -> None:
         pair.instance.feed(message.pack(codec))
 
 
-def complain(pair: Pair) -> None:
+def report_no_gps(pair: Pair) -> None:
     pair.instance.autopilot.commander.texts.append(StatusText(Severity.CRITICAL, "No GPS"))
 
 
@@ -353,31 +353,31 @@ STOPPED = "stop requested by the operator"
 BOOTING = faults.heartbeats(system_status=1, base_mode=81, custom_mode=0)  # disarmed, STABILIZE
 BOOTING_ARMED = faults.heartbeats(system_status=1, base_mode=209, custom_mode=0)
 HELICOPTER = config.vehicle("px4_sih").model_copy(update={"airframe": "helicopter"})
-SOON, LATER = {"health_s": 5.0}, {"health_s": 8.0}
+HEALTH_IN_5_S, HEALTH_IN_8_S = {"health_s": 5.0}, {"health_s": 8.0}
 NO_TAKEOFF = Rule("takeoff", result=Result.FAILED)
 LONG = (HIGH, "reference.duration_s=6.0")
 PX4_HOVERS, COPTER_HOVERS = partial(px4.hover, *LONG), partial(copter.hover, *LONG)
-HOLDS = faults.with_default("COM_OBL_RC_ACT", 5.0)  # without setpoints AUTO.LOITER, not POSCTL
+LOITERS = faults.with_default("COM_OBL_RC_ACT", 5.0)  # without setpoints AUTO.LOITER, not POSCTL
 SILENT = r"no telemetry for 1.0 s \(limits.silence_s is 1\)$"  # does not mention a pilot
 MODES = (faults.HEARTBEAT, faults.CURRENT_MODE)
 REJECTED = r"; the vehicle said: command {} TEMPORARILY_REJECTED; unhealthy by SYS_STATUS: RC_"
 ROWS = {
     "armed by another": flies(whole, at=then(Phase.STREAM, 0.5, arm)),
     # the operator
-    "stop in arm, and it cannot be disarmed": aborts(
+    "stop while arming, and the vehicle cannot be disarmed": aborts(
         Phase.FAILED, f"{STOPPED}; still armed after 5 s", armed=True,
         firmware=faults.refusing("disarm", "Disarming denied"),
         at=then(Phase.ARM, 0.3, faults.stop),
     ),
     "stop before lift-off": refusal(STOPPED, stayed_down, at=then(Phase.TAKEOFF, 0.3, faults.stop)),
-    "stop before lift-off, and nothing is heard any more": aborts(
+    "stop before lift-off, and the vehicle falls silent": aborts(
         Phase.FAILED,
         f"{STOPPED} before lift-off; no HEARTBEAT shows whether it is armed after 5 s",
         asked_to_disarm, armed=True, at=then(Phase.TAKEOFF, 0.3, stop_unheard),
     ),
     # the land detector reports flight before the vehicle lifts off
-    "stop as it lifts off": ends(STOPPED, landed, at=then(Phase.TAKEOFF, 0.5, faults.stop)),
-    "stop after the pilot has engaged it in the air, before we ask": ends(
+    "stop at lift-off": ends(STOPPED, landed, at=then(Phase.TAKEOFF, 0.5, faults.stop)),
+    "stop after the pilot has engaged, before our mode request": ends(
         STOPPED, landed, fly=px4.hover, ended_by="operator",
         at=[
             *then(Phase.STREAM, 0.2, engage),
@@ -391,13 +391,13 @@ ROWS = {
     ),
     "the land detector is not heard": refusal(
         r"not ready: it does not report whether it flies \(EXTENDED_SYS_STATE\)", nothing_sent,
-        down=faults.without(faults.EXTENDED_SYS_STATE), limits=SOON,
+        down=faults.without(faults.EXTENDED_SYS_STATE), limits=HEALTH_IN_5_S,
     ),
-    "it receives nothing any more": refusal(
+    "the vehicle receives nothing": refusal(
         "not ready: no TIMESYNC request was answered for 5 s: does the vehicle receive them?",
-        nothing_sent, at=then(Phase.HEALTH, 0.2, deafen), limits=SOON,
+        nothing_sent, at=then(Phase.HEALTH, 0.2, deafen), limits=HEALTH_IN_5_S,
     ),
-    "no HEARTBEAT from the request for the mode on": aborts(
+    "no HEARTBEAT since the mode request": aborts(
         Phase.FAILED,
         ".*it is not known whether the vehicle has armed; "
         "no HEARTBEAT shows whether it is armed after 5 s",
@@ -412,7 +412,7 @@ ROWS = {
         + REJECTED.format(176), on_the_ground,
         firmware=faults.refusing("mode", "Switching to Offboard is not available"),
     ),
-    "parameter wrong": refusal(  # reported before the vehicle has a position
+    "wrong parameter": refusal(  # reported before the vehicle has a position
         "COM_OF_LOSS_T is 30: seconds without setpoints before the failsafe. "
         "Fix: param set COM_OF_LOSS_T 1",
         nothing_sent, firmware=faults.with_default("COM_OF_LOSS_T", 30.0),
@@ -420,7 +420,7 @@ ROWS = {
     ),
     "no reply for GUID_OPTIONS, which may say that thrust is a climb rate": refusal(
         "not ready: no reply for parameter GUID_OPTIONS", nothing_sent, fly=copter.hop,
-        down=faults.without(faults.PARAM_VALUE), limits=LATER,
+        down=faults.without(faults.PARAM_VALUE), limits=HEALTH_IN_8_S,
     ),
     # the MAV_TYPE in HEARTBEAT decides which vehicles are flown
     "a plane": of_type(1, "the vehicle is a FIXED_WING; offboard flies multirotors"),
@@ -438,8 +438,8 @@ ROWS = {
     ),
     "no position, and the vehicle says why": refusal(
         "not ready: no LOCAL_POSITION_NED arrives; the vehicle said: No GPS .limits", nothing_sent,
-        fly=copter.hop, down=faults.without(faults.POSITION), limits=SOON,
-        at=then(Phase.HEALTH, 2.0, complain),
+        fly=copter.hop, down=faults.without(faults.POSITION), limits=HEALTH_IN_5_S,
+        at=then(Phase.HEALTH, 2.0, report_no_gps),
     ),
     "restart on the ground": refusal(
         "the vehicle restarted", on_the_ground, at=then(Phase.STREAM, 0.5, faults.restart)
@@ -448,16 +448,16 @@ ROWS = {
         "the vehicle's own failsafe flew it, in POSCTL; the vehicle said: ",
         landed_by_its_failsafe, ended_by="link", firmware=faults.refusing("land", "No."),
     ),
-    "its land detector knows the ground, and it does not disarm by itself": flies(
+    "on the ground by its land detector, the vehicle does not disarm": flies(
         asked_to_disarm_without_force, fly=hover_without_disarming
     ),
     # only the land detector shows whether it flies: it is not disarmed, and the user is told
-    "its land detector does not see the ground": aborts(
+    "the land detector never reports the ground": aborts(
         Phase.FAILED, f".*not landed and disarmed after 24 s; {STILL_ARMED}", left_to_the_user,
         fly=copter.hover, armed=True, scenario="never_landed", limits={"land_s": 24.0},
     ),
     # PX4 returns to OFFBOARD, which CURRENT_MODE shows before HEARTBEAT shows it disarmed
-    "the landing mode is left as it disarms": flies(
+    "PX4 leaves the landing mode as it disarms": flies(
         fly=partial(px4.hover, "reference.duration_s=3.3")
     ),
     "a ground station sets a parameter in flight, twice": flies(
@@ -474,7 +474,7 @@ ROWS = {
         fly=px4.hop, boot_scale=1.0,
         scenario=scenario_of({"fault": "thrust_change", "thrust_scale": 0.4}),
     ),
-    "too weak to lift off, and it does not disarm by itself": ends(
+    "too weak to lift off, and the vehicle does not disarm by itself": ends(
         "no lift-off in 8 s; is hover_thrust in the vehicle file right", asked_to_disarm,
         fly=px4.hop, boot_scale=1.0, limits={"land_s": 12.0},
         at=then(Phase.TAKEOFF, 0.1, never_disarms),
@@ -494,7 +494,7 @@ ROWS = {
         the_pilots, fly=partial(px4.hover, HIGH), armed=True,
         at=[*then(Phase.HOVER, 0.2, late_both_ways), *then(Phase.LAND, 5.5, Pair.pilot_takes_over)],
     ),
-    "pilot takes over as it arms": aborts(
+    "pilot takes over while arming": aborts(
         Phase.YIELDED, "the vehicle left OFFBOARD for AUTO.LOITER as it armed", the_pilots,
         armed=True, at=then(Phase.ARM, 0.0, Pair.pilot_takes_over),
     ),
@@ -503,11 +503,11 @@ ROWS = {
         ended_by="disarmed in flight", at=tracking(lambda pair: pair.ground(400, 0, 21196)),
     ),
     # the link
-    "a fifth is lost, duplicated, reordered, some 2.5 s late, with garbage between": flies(
+    "lossy link: a fifth lost, some duplicated, reordered, 2.5 s late, garbage": flies(
         without_a_gap, fly=px4.lap, up=faults.losing(0.2, seed=4),
         down=faults.both(faults.losing(0.2), faults.both(faults.shuffling(), faults.noisy)),
     ),
-    "dies in flight": aborts(
+    "the vehicle falls silent in flight": aborts(
         Phase.FAILED,
         "no telemetry for 1.0 s .*; not heard for 300 s while landing; last known: armed in ",
         held_then_silent, fly=px4.lap, armed=True, ended_by="link",
@@ -529,30 +529,30 @@ ROWS = {
         ended_by="restart",
         at=then(Phase.LAND, 0.5, faults.downlink(BOOTING)),
     ),
-    "restart of an ArduCopter while landing that stays armed": aborts(
+    "restart while landing of an ArduCopter that stays armed": aborts(
         Phase.YIELDED, "the vehicle restarted while landing; the vehicle left LAND for STABILIZE",
         fly=copter.hover, armed=True, ended_by="restart",
         at=then(Phase.LAND, 0.5, faults.downlink(BOOTING_ARMED)),
     ),
     "restart while landing": ends(
         "the vehicle restarted while landing", fly=px4.hover, ended_by="restart",
-        scenario=scenario_of(EARLIER),
+        scenario=scenario_of(CLOCK_SET_BACK),
     ),
     "restart in flight of a vehicle that stays armed": ends(
         "the vehicle restarted in flight", soft_landing, fly=px4.lap,
         at=tracking(faults.downlink(faults.restamped(10.0))),
     ),
-    "heartbeats stop while it lands, position and mode go on": aborts(
+    "heartbeats stop while landing, position and mode continue": aborts(
         Phase.FAILED, "it stands on the ground, and no HEARTBEAT shows whether it is disarmed",
         fly=px4.hover, limits={"land_s": 20.0},
         at=then(Phase.LAND, 0.0, silent(faults.HEARTBEAT)),
     ),
-    "position and attitude stop, heartbeats go on, the requests to land are lost for 3.5 s": aborts(
+    "position and attitude stop, heartbeats continue, land requests lost for 3.5 s": aborts(
         Phase.FAILED, "no telemetry for 1.0 s .*; disarmed, landing not confirmed: ",
         landing_requested, asks_each_second, fly=copter.lap,
         at=tracking(in_turn(silent(faults.POSITION, faults.ATTITUDE), loses_commands(3.5))),
     ),
-    "restart while landing, the requests to land are lost for 2 s": ends(
+    "restart while landing, land requests lost for 2 s": ends(
         "the vehicle restarted while landing", landed, fly=px4.hover,
         at=[
             *then(Phase.HOVER, 0.0, loses_commands(6.0)),
@@ -564,13 +564,13 @@ ROWS = {
         SILENT, landed, asks_once, fly=PX4_HOVERS, at=tracking(faults.cut(1.6))
     ),
     "an outage of 4 s": ends(
-        SILENT, landed, asks_again, fly=PX4_HOVERS, firmware=HOLDS, at=tracking(faults.cut(4.0))
+        SILENT, landed, asks_again, fly=PX4_HOVERS, firmware=LOITERS, at=tracking(faults.cut(4.0))
     ),
     "an outage of 10 s": ends(
         SILENT, landed, asks_again, fly=COPTER_HOVERS, at=tracking(faults.cut(10.0))
     ),
     # a rate is measured over two seconds. A booting ArduCopter sends no position for 40 s
-    "a message that has just begun to arrive is not called slow": flies(
+    "a message that has just begun to arrive is not reported as slow": flies(
         waits_for_position_and_delay, down=begins_to_arrive(faults.POSITION, 12.0)
     ),
     # round trip of 0.36 s. Without telemetry no TIMESYNC request is sent, so none is unanswered
@@ -584,22 +584,22 @@ ROWS = {
         at=[*tracking(faults.cut(4.0)), *then(Phase.LAND, 1.5, switches("POSCTL"))],
     ),
     # its telemetry is lost, and a pilot takes over after the first request to land
-    "landing is not asked again of a vehicle that is not heard": aborts(
+    "landing is not requested again without telemetry": aborts(
         Phase.YIELDED, ".*left GUIDED for LOITER", not_asked_again, fly=COPTER_HOVERS, armed=True,
         at=[*tracking(faults.cut(4.0, ways=["down"])), *then(Phase.LAND, 0.6, switches("LOITER"))],
     ),
-    "no report of the mode for 9 s": ends(
-        "no report of the mode for 2.", listens, fly=PX4_HOVERS, firmware=HOLDS,
+    "no mode report for 9 s": ends(
+        "no report of the mode for 2.", listens, fly=PX4_HOVERS, firmware=LOITERS,
         at=tracking(faults.cut(9.0, *MODES, ways=["down"])),
     ),
-    "no report of the mode for 9 s, in which a pilot takes it": aborts(
+    "no mode report for 9 s, while a pilot takes over": aborts(
         Phase.YIELDED, "no report of the mode for 2.", listens, fly=COPTER_HOVERS, armed=True,
         at=[*tracking(faults.cut(9.0, *MODES, ways=["down"])),
             *then(Phase.LAND, 1.0, switches("BRAKE"))],
     ),
     # ArduCopter does not report it. Setpoints decided meanwhile would have made it fall when they
     # arrived
-    "it does not receive setpoints": ends(
+    "the vehicle does not receive setpoints": ends(
         "15 TIMESYNC requests in a row were not answered: does the vehicle receive setpoints",
         held_soon,
         fly=COPTER_HOVERS, failsafes=["uplink"], fall_mps=1.6, top_m=3.5,
@@ -610,21 +610,21 @@ ROWS = {
         fly=PX4_HOVERS, at=tracking(lose_two_heartbeats)
     ),
     # regression: by a HEARTBEAT from before the outage it was disarmed, and so it was left armed
-    "an outage as it arms": refusal(
+    "an outage while arming": refusal(
         "no telemetry for 1.0 s$", at=[(lambda pair: pair.armed, faults.cut(2.3))]
     ),
     # a jump by 35 s, beyond the end of the reference
-    "a jump of its clock": ends(
+    "a jump of the vehicle clock": ends(
         "the clock of the vehicle jumped by 35.0 s$", soft_landing, not_completed,
         fly=copter.lap,
         scenario=early("clock_jump_35s"), deadline_s=0.05,
     ),
     # the scenario also makes the vehicle heavier
-    "every tenth position": flies(
+    "only every tenth position arrives": flies(
         fly=copter.lap, scenario=early("thin_telemetry", 5.0), failsafes=(), error_m=0.3
     ),
     # the law
-    "a law that fails twice, twice, and once overturns": flies(
+    "a law fails for two decisions, twice, and then overturns once": flies(
         bridged, fly=px4.lap,
         wrap=lambda law: faults.failing(faults.overturns, 1, 38)(
             faults.failing(faults.raises, 2, 34)(faults.failing(faults.no_direction, 2, 30)(law))
@@ -634,5 +634,5 @@ ROWS = {
 
 
 @pytest.mark.parametrize("title", ROWS)
-def test_flight(title: str) -> None:
+def test_flight_with_a_fault_ends_as_expected(title: str) -> None:
     judged(ROWS[title])

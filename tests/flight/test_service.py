@@ -79,7 +79,7 @@ def commanded(pair: Serving, since_s: float) -> list[str]:
 
 
 @BOTH
-def test_engaged_handed_back_and_engaged_again(served: Served, on: str) -> None:
+def test_service_is_engaged_handed_back_and_engaged_again(served: Served, on: str) -> None:
     """In the first flight the service's process is paused for half a second; the sentence after the
     flight counts the skipped ticks of 0.1 s. On a stop request the service hands back first."""
     pair = served.aloft(on)
@@ -130,7 +130,7 @@ def test_engaged_handed_back_and_engaged_again(served: Served, on: str) -> None:
     assert pair.service.current.outcome.exit_code == 0
 
 
-def test_a_pilot_may_take_a_vehicle_that_is_handed_back(served: Served) -> None:
+def test_pilot_may_take_over_during_hand_back(served: Served) -> None:
     """The service is being stopped, and the vehicle has not shown its hold mode yet."""
     pair = served.engaged()
     pair.service.request_stop()
@@ -164,7 +164,7 @@ def fly_north(pair: Serving, speed_mps: float) -> None:
 
 
 @BOTH
-def test_engaged_again_at_once(served: Served, on: str) -> None:
+def test_immediate_second_engagement_stays_near_hover_thrust(served: Served, on: str) -> None:
     """Regression: before its first position the second flight assumed the vehicle at the origin,
     and demanded full thrust."""
     pair = served.engaged(on)
@@ -180,7 +180,7 @@ def test_engaged_again_at_once(served: Served, on: str) -> None:
 
 
 @BOTH
-def test_engaged_in_motion(served: Served, on: str) -> None:
+def test_engagement_in_motion_keeps_the_vertical_thrust(served: Served, on: str) -> None:
     """The vertical thrust stays that of hover although the vehicle is tilted, and the reference
     begins at the vehicle's position."""
     pair = served.aloft(on)
@@ -207,7 +207,7 @@ def test_engaged_in_motion(served: Served, on: str) -> None:
     assert max(off_m) < 0.1
 
 
-def test_a_contradicted_vehicle_is_identified_again(served: Served) -> None:
+def test_contradicted_stored_vehicle_is_discarded(served: Served) -> None:
     """The stored constants are those of a vehicle whose tilt responds three times as late."""
     true = simulated.vehicle("px4_sih")
     late = {"delay_s": 0.2, "natural_frequency_radps": 6.0}
@@ -221,7 +221,7 @@ def test_a_contradicted_vehicle_is_identified_again(served: Served) -> None:
     assert said(pair, "contradicted, and discarded")
 
 
-def test_what_is_identified_in_motion_is_remembered(served: Served) -> None:
+def test_drag_identified_in_motion_is_stored(served: Served) -> None:
     """Also if the vehicle was identified before: here its drag is 2.5 times the stored value."""
     true = simulated.vehicle("px4_sih")
     known = true.model_copy(update={"drag_translation_npmps": (0.4 * true.mass_kg,) * 3})
@@ -234,7 +234,7 @@ def test_what_is_identified_in_motion_is_remembered(served: Served) -> None:
     assert pair.remembered.vehicle.drag_per_mass_ps == pytest.approx(true.drag_per_mass_ps, rel=0.1)
 
 
-def test_a_limit_of_the_autopilot_is_read_anew(served: Served) -> None:
+def test_autopilot_limits_replace_those_of_a_stored_vehicle(served: Served) -> None:
     """The stored vehicle has a lower limit of the angular acceleration than the autopilot now."""
     copter = simulated.vehicle("arducopter")
     slow = copter.model_copy(update={"angular_acceleration_limit_radps2": (2.3, 2.3, 2.2)})
@@ -251,7 +251,7 @@ def test_a_limit_of_the_autopilot_is_read_anew(served: Served) -> None:
 @pytest.mark.parametrize(
     ("on", "left"), [("px4", "px4-1-1"), ("px4", "px4-1-ff"), ("ardupilot", "")]
 )
-def test_a_restarted_service_holds_what_it_has_engaged_and_nothing_else(
+def test_restarted_service_holds_only_its_engaged_vehicle(
     served: Served, on: str, left: str
 ) -> None:
     """Afterwards it waits for the pilot. In the other two cases a flight with another vehicle was
@@ -278,7 +278,7 @@ def test_a_restarted_service_holds_what_it_has_engaged_and_nothing_else(
     pair.engage()
 
 
-def test_a_take_off_point_that_was_not_seen_is_no_origin(served: Served) -> None:
+def test_anchor_origin_needs_a_known_takeoff_point(served: Served) -> None:
     """A service that starts in the air with --anchor origin engages only after the next landing."""
     pair = served("ardupilot", anchor="origin")
     pair.fly_up()
@@ -297,7 +297,7 @@ def test_a_take_off_point_that_was_not_seen_is_no_origin(served: Served) -> None
     assert said(pair, "not engaged: its take-off point is not known")
 
 
-def test_without_its_supervisor_a_flight_goes_on_and_none_begins(served: Served) -> None:
+def test_lost_supervisor_prevents_only_new_flights(served: Served) -> None:
     pair = served.engaged()
     pair.service.current.guard(False)
     pair.run(1.0)
@@ -309,7 +309,7 @@ def test_without_its_supervisor_a_flight_goes_on_and_none_begins(served: Served)
     pair.until(lambda: pair.mode == "AUTO.LOITER", 1.0)
 
 
-def test_another_controller_is_left_alone(served: Served) -> None:
+def test_service_leaves_another_controller_alone(served: Served) -> None:
     """While its setpoints are on the link, the service sends no setpoint and no command."""
     pair = served.aloft()
     pair.other_setpoint()
@@ -328,7 +328,7 @@ def test_another_controller_is_left_alone(served: Served) -> None:
     assert said(pair, "not engaged: OFFBOARD, but another program sends setpoints")
 
 
-def test_engaged_while_it_lands_or_stands_it_is_not_flown_and_the_pilot_is_told(
+def test_engagement_while_landing_or_grounded_is_refused(
     served: Served,
 ) -> None:
     """Regression: ArduCopter stayed in GUIDED without setpoints, and the pilot was not told. In
@@ -360,7 +360,7 @@ def test_engaged_while_it_lands_or_stands_it_is_not_flown_and_the_pilot_is_told(
     assert sent_after(pair, switched_s) == []
 
 
-def test_without_arms_it_stays_on_the_ground(served: Served) -> None:
+def test_service_without_arms_option_stays_on_the_ground(served: Served) -> None:
     """Another vehicle is heard once, which prevents standby for 10 s. A start is rejected, and a
     vehicle that is armed in OFFBOARD does not lift off. On the ground, a flight that was cut short
     counts as ended: whoever engages the vehicle later is another controller."""
@@ -393,7 +393,7 @@ def test_without_arms_it_stays_on_the_ground(served: Served) -> None:
     assert said(pair, "ended: stop requested by the operator")
 
 
-def test_with_arms_a_start_takes_off_and_flies(served: Served) -> None:
+def test_start_command_with_arms_option_takes_off(served: Served) -> None:
     """Regression: after a start that was stopped while arming, each later start stood down at once,
     because the answer to the first arming command was taken for its own."""
     pair = served(arms=True, then="land")
@@ -417,7 +417,7 @@ def test_with_arms_a_start_takes_off_and_flies(served: Served) -> None:
 # --- what happens in between ----------------------------------------------------------------------
 
 
-def test_a_reboot_between_two_flights(served: Served) -> None:
+def test_service_flies_again_after_a_vehicle_reboot(served: Served) -> None:
     pair = served.engaged()
     pair.switch("land")
     pair.until(lambda: not pair.armed, 40.0)
@@ -432,7 +432,7 @@ def test_a_reboot_between_two_flights(served: Served) -> None:
 
 
 @BOTH
-def test_after_an_outage_it_is_landed(served: Served, on: str) -> None:
+def test_vehicle_is_landed_after_a_link_outage(served: Served, on: str) -> None:
     """ArduCopter, not heard for 4 s, has stayed in GUIDED without setpoints. PX4 would return from
     its failsafe to OFFBOARD when setpoints arrive again, although no pilot has switched; so none is
     sent."""
@@ -448,7 +448,7 @@ def test_after_an_outage_it_is_landed(served: Served, on: str) -> None:
         pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
 
 
-def test_requests_over_mavlink(served: Served) -> None:
+def test_mavlink_commands_pause_continue_start_and_hand_back(served: Served) -> None:
     """A command that is repeated, as by a ground station that missed the answer, is accepted again.
     A pause is rejected while the vehicle is handed back."""
     pair = served.engaged("ardupilot", reference="lemniscate")
@@ -497,7 +497,7 @@ def test_requests_over_mavlink(served: Served) -> None:
     ask(PAUSE_CONTINUE, 0.0, result=TEMPORARILY_REJECTED)
 
 
-def test_requests_within_one_tick(served: Served) -> None:
+def test_hand_back_takes_precedence_over_start_within_a_tick(served: Served) -> None:
     """A hand-back cancels a start of the same tick; a start does not cancel a hand-back."""
     pair = served("ardupilot", arms=True)
     pair.until(lambda: pair.phase is Phase.STANDBY)
@@ -513,7 +513,7 @@ def test_requests_within_one_tick(served: Served) -> None:
     assert flies.acks == [(SET_MODE, ACCEPTED), (START, TEMPORARILY_REJECTED)]
 
 
-def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) -> None:
+def test_pilot_takes_over_with_a_short_com_of_loss_t(served: Served) -> None:
     """Regression: with COM_OF_LOSS_T of 0.3 s setpoints always seemed to be missing, and the
     pilot's mode was taken for the vehicle's failsafe. Then the pilot engages and takes over again
     at once: a real PX4 was asked to land, because no TIMESYNC request was sent while the HEARTBEAT
@@ -541,7 +541,7 @@ def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) ->
     assert pair.landings == []
 
 
-def test_where_heartbeat_alone_shows_the_mode_a_switch_is_seen_soon(served: Served) -> None:
+def test_mode_switch_is_seen_soon_without_current_mode(served: Served) -> None:
     """PX4 1.14 sends no CURRENT_MODE, and one HEARTBEAT a second. If the service waited for that,
     the vehicle would meanwhile follow setpoints that only repeat its attitude."""
     pair = served.aloft()
@@ -568,7 +568,7 @@ def silence(pair: Serving, options: float) -> None:
     assert len(pair.commands(512)) > asked
 
 
-def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) -> None:
+def test_parameters_and_uid_are_read_again_after_a_silence(served: Served) -> None:
     """It may have the same system id, use the same radio, and have booted earlier. So parameters
     and hardware number are read again. Regression: it was flown with the parameters of the vehicle
     before, and took thrust for a climb rate."""
@@ -590,7 +590,7 @@ def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) ->
     assert pair.state.vehicle.uid == 1
 
 
-def test_a_request_in_the_tick_of_a_transition_is_obeyed(served: Served) -> None:
+def test_request_just_before_a_phase_change_is_obeyed(served: Served) -> None:
     """Regression: a request in the last step before the phase changes was acknowledged, but
     forgotten."""
 
@@ -612,7 +612,7 @@ def test_a_request_in_the_tick_of_a_transition_is_obeyed(served: Served) -> None
         assert (pair.acks[-1], pair.mode) == ((SET_MODE, ACCEPTED), "AUTO.LOITER")
 
 
-def test_a_vehicle_that_is_engaged_as_the_service_stops_is_held(served: Served) -> None:
+def test_vehicle_engaged_as_the_service_stops_is_held(served: Served) -> None:
     pair = served.aloft()
     pair.run(0.04)  # the report of the mode comes between two ticks
     pair.switch("engage")
@@ -623,7 +623,7 @@ def test_a_vehicle_that_is_engaged_as_the_service_stops_is_held(served: Served) 
     assert pair.mode == "AUTO.LOITER"
 
 
-def test_the_reference_is_repeated_with_the_newest_configuration(served: Served) -> None:
+def test_repeats_keep_the_configuration_of_their_flight(served: Served) -> None:
     """The repeats are one flight with its own configuration; the next flight uses the newest one.
     The number of stored announcements is limited, because a service may run for weeks."""
     pair = served.engaged(then="repeat")
@@ -707,12 +707,12 @@ EVENTS: dict[str, Callable[[Serving, float], object]] = {
     "engage on ground": lambda pair, _: pair.switch("engage"),
     "engage": engage,
     "freeze": lambda pair, for_s: pair.pause(0.4 * for_s),
-    "up lost": lose("lost_up"),
+    "uplink lost": lose("lost_up"),
     "kill": lambda pair, _: pair.restart(),
     "second sender": lambda pair, _: pair.other_setpoint(),
     "switch": lambda pair, _: pair.switch("pilot"),
     "stop": stop,
-    "down lost": lose("lost_down"),
+    "downlink lost": lose("lost_down"),
     "hand back": lambda pair, _: pair.command(SET_MODE, 1, 4, 3),
     "land": lambda pair, _: pair.switch("land"),
     "arm": lambda pair, _: pair.ground(ARM, 1),
@@ -727,7 +727,7 @@ EVENTS: dict[str, Callable[[Serving, float], object]] = {
 @BOTH
 @pytest.mark.slow
 @pytest.mark.timeout(0)
-def test_nothing_unsafe_in_a_day(served: Served, on: str) -> None:
+def test_random_events_cause_nothing_unsafe(served: Served, on: str) -> None:
     """Each event happens once, then random ones, until OFFBOARD_DAY_S seconds have passed."""
     pair = served(on)
     chance = random.Random(int(os.environ.get("OFFBOARD_DAY_SEED", "1")))

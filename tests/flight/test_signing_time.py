@@ -29,7 +29,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "state" / "offboard"
 
 
-def test_stamps_do_not_go_back_with_the_clock_or_after_a_crash(
+def test_signing_stamps_increase_across_clock_steps_and_restarts(
     home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stamps are reserved in the file before they are used, here during an hour per clock."""
@@ -50,7 +50,7 @@ def test_stamps_do_not_go_back_with_the_clock_or_after_a_crash(
     assert newest >= (1_900_000_000 - 1_420_070_400) * 100_000
 
 
-def test_keys_have_files_of_their_own_that_do_not_show_them(
+def test_each_key_has_a_file_that_does_not_show_it(
     home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for key in (KEY, bytes(32)):
@@ -63,7 +63,7 @@ def test_keys_have_files_of_their_own_that_do_not_show_them(
     assert state_directory() == Path("/var/lib/a")
 
 
-def test_a_damaged_file_and_a_directory_that_cannot_be_written_are_refused(home: Path) -> None:
+def test_damaged_stamp_file_and_unwritable_directory_are_refused(home: Path) -> None:
     with SigningTime(KEY):
         pass
     (file,) = home.iterdir()
@@ -117,7 +117,7 @@ def test_forged_frames_in_flight_change_nothing_and_are_counted(tmp_path: Path) 
     assert KEY not in (tmp_path / "flight.tlog").read_bytes()
 
 
-def test_a_vehicle_that_reboots_with_its_old_stamps_is_heard_again() -> None:
+def test_vehicle_with_old_stamps_after_a_reboot_is_heard() -> None:
     pair = signed_hover()
     session: Any = pair.companion.session
     session._signing.offset = 10**12  # our clock is right, the vehicle's is years behind

@@ -36,7 +36,7 @@ from offboard.mavlink.signing import Signing
 from offboard.supervisor.recovery import Supervised
 from offboard.supervisor.supervisor import Supervisor
 
-LONG_S = 20.0
+TIMEOUT_S = 20.0
 OFFBOARD, POSCTL, LOITER, LANDING = (
     0x00060000,
     0x00030000,
@@ -66,7 +66,7 @@ class Rig:
         self.vehicle = socket.socket(
             socket.AF_INET, socket.SOCK_STREAM if stream else socket.SOCK_DGRAM
         )
-        self.vehicle.settimeout(LONG_S)
+        self.vehicle.settimeout(TIMEOUT_S)
         self.vehicle.bind(("127.0.0.1", 0))
         self.peer: Any = "tcp" if stream else self.vehicle.getsockname()
         port = self.peer[1] if kind == "udpout" else free_port()
@@ -92,7 +92,7 @@ class Rig:
         self.link.close()
 
     def await_end(self) -> None:
-        self.supervisor.process.wait(LONG_S)
+        self.supervisor.process.wait(TIMEOUT_S)
 
     def next_message(self, kind: str = "COMMAND_LONG") -> Any:
         """Return the next message of this kind that the vehicle receives."""
@@ -126,7 +126,7 @@ def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
 
 
 @over("tcpin")
-def test_it_asks_the_vehicle_that_connected_last(rig: Rig) -> None:
+def test_supervisor_commands_the_newest_tcp_connection(rig: Rig) -> None:
     """One connection has ended, and another one begins after the controller has ended."""
     rig.beat(OURS)
     rig.vehicle.close()
@@ -141,7 +141,7 @@ def test_it_asks_the_vehicle_that_connected_last(rig: Rig) -> None:
 
 
 @over("udpin")
-def test_it_asks_a_vehicle_that_sends_from_a_new_port(rig: Rig) -> None:
+def test_supervisor_commands_a_vehicle_on_a_new_port(rig: Rig) -> None:
     """A router restarts when the controller is killed."""
     rig.beat(OURS)
     rig.vehicle.close()
@@ -162,7 +162,7 @@ def test_it_asks_a_vehicle_that_sends_from_a_new_port(rig: Rig) -> None:
 
 
 @over("signed")
-def test_it_signs_with_stamps_that_follow_ours(rig: Rig) -> None:
+def test_supervisor_signs_with_later_stamps_than_the_controller(rig: Rig) -> None:
     ours = Session(SessionSettings(), rig.signing)
     ours.senders.set_vehicle(VEHICLE, "tcp")
     for _ in range(3):
@@ -182,7 +182,7 @@ def test_it_signs_with_stamps_that_follow_ours(rig: Rig) -> None:
     assert all(each.frame.signed for each in tlog.read(rig.log.path) if each.name != "TUNNEL")
 
 
-def test_it_takes_over_when_the_beats_stop_and_says_so_first(rig: Rig) -> None:
+def test_supervisor_takes_over_when_the_beats_stop(rig: Rig) -> None:
     """Signals do not end it: a service manager signals all processes of a service."""
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         os.kill(rig.supervisor.process.pid, number)
@@ -198,7 +198,7 @@ def test_it_takes_over_when_the_beats_stop_and_says_so_first(rig: Rig) -> None:
     assert not rig.supervisor.lost
 
 
-def test_a_controller_that_hangs_and_is_then_killed_is_scored(rig: Rig) -> None:
+def test_flight_of_a_hung_and_killed_controller_is_scored(rig: Rig) -> None:
     """The watchdog of a service manager does this."""
     for entry in tlog.read(RECORDING):
         rig.log.write(entry.unix_us, entry.frame.raw)
@@ -214,14 +214,14 @@ def beat_until(rig: Rig, guards: bool, guard: Supervised) -> float:
     """Send beats until `Supervisor.guards` has this value. Return how long that took, in s."""
     began_s = clock.monotonic_s()
     while rig.supervisor.guards is not guards:
-        assert clock.monotonic_s() < began_s + LONG_S
+        assert clock.monotonic_s() < began_s + TIMEOUT_S
         rig.beat(guard)
         time.sleep(0.02)
         rig.supervisor.has_taken_over()  # reads its answer
     return clock.monotonic_s() - began_s
 
 
-def test_one_that_is_stopped_does_not_guard_until_it_continues(rig: Rig) -> None:
+def test_stopped_supervisor_does_not_guard_until_it_continues(rig: Rig) -> None:
     """This shows within two seconds, on the ground and in flight. The supervisor does not take its
     own pause for a silence of the controller: it takes over not when it continues, but when beats
     stop."""
@@ -242,7 +242,7 @@ def test_one_that_is_stopped_does_not_guard_until_it_continues(rig: Rig) -> None
     rig.disarm()
 
 
-def test_stopped_while_the_controller_ends_it_knows_the_failsafe_of_the_vehicle(rig: Rig) -> None:
+def test_stopped_supervisor_recognises_the_vehicles_failsafe(rig: Rig) -> None:
     """Beats contain the time at which they were sent. Regression: counted from the time of reading,
     the failsafe seemed too early and so to be a pilot's choice."""
     rig.beat(replace(OURS, setpoint_loss=SetpointLoss(1.0, ("AUTO.LOITER",))))
@@ -259,7 +259,7 @@ def test_stopped_while_the_controller_ends_it_knows_the_failsafe_of_the_vehicle(
 
 
 @over("udpin", "udpout")
-def test_the_report_of_the_mode_may_be_old_and_is_awaited_then(rig: Rig) -> None:
+def test_supervisor_waits_for_a_fresh_mode_report(rig: Rig) -> None:
     """This happens after a pause of the controller, or in an outage. Without a fresh report nothing
     is requested; hold is requested as soon as the vehicle shows our mode."""
     old = replace(OURS, reported_s=clock.monotonic_s() - 3.0)
@@ -268,16 +268,16 @@ def test_the_report_of_the_mode_may_be_old_and_is_awaited_then(rig: Rig) -> None
     rig.vehicle.settimeout(0.7)  # less than the period of HEARTBEAT
     with pytest.raises(TimeoutError):
         rig.next_message()
-    rig.vehicle.settimeout(LONG_S)
+    rig.vehicle.settimeout(TIMEOUT_S)
     rig.report(OFFBOARD)
     assert rig.next_message().command == 176
     rig.disarm()
 
 
-@pytest.mark.parametrize("guard", [ON_GROUND, NOT_OURS, OURS], ids=["on ground", "left", "taken"])
-def test_a_vehicle_that_is_not_ours_or_on_the_ground_is_left_alone(
-    guard: Supervised, rig: Rig
-) -> None:
+@pytest.mark.parametrize(
+    "guard", [ON_GROUND, NOT_OURS, OURS], ids=["on ground", "not ours", "taken by a pilot"]
+)
+def test_supervisor_leaves_a_foreign_or_grounded_vehicle_alone(guard: Supervised, rig: Rig) -> None:
     """This is known from the newest beat; or from the newest report, which is read last, after more
     than one batch of datagrams."""
     rig.beat(OURS)
@@ -291,7 +291,7 @@ def test_a_vehicle_that_is_not_ours_or_on_the_ground_is_left_alone(
         rig.next_message()
 
 
-def test_a_supervisor_that_ends_is_noticed_and_another_one_takes_over(rig: Rig) -> None:
+def test_killed_supervisor_is_noticed_and_replaced(rig: Rig) -> None:
     rig.beat(OURS)
     assert not rig.supervisor.lost
     os.kill(rig.supervisor.process.pid, signal.SIGKILL)
@@ -311,16 +311,18 @@ def test_a_supervisor_that_ends_is_noticed_and_another_one_takes_over(rig: Rig) 
     rig.disarm()
 
 
-def test_it_ends_in_silence_with_a_controller_that_ends_before_it_has_started() -> None:
+def test_supervisor_without_a_controller_ends_silently() -> None:
     ours, its = socket.socketpair()
     ours.close()
     command = [sys.executable, "-P", "-m", "offboard.supervisor.process"]
     with its:
-        ended = subprocess.run(command, stdin=its, capture_output=True, timeout=LONG_S, check=False)
+        ended = subprocess.run(
+            command, stdin=its, capture_output=True, timeout=TIMEOUT_S, check=False
+        )
     assert (ended.returncode, ended.stderr) == (0, b"")
 
 
-def test_a_supervisor_that_cannot_be_started_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_start_of_the_supervisor_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     """For example if there are too many processes. No descriptor is left open."""
     monkeypatch.setattr(sys, "executable", "/no/such/python")
     supervisor = Supervisor()

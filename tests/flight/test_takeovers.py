@@ -79,7 +79,7 @@ def asked(judge: Judge, command: int, after_s: float) -> Callable[[Pair], bool]:
     "seed",
     [*range(QUICK), *(pytest.param(n, marks=pytest.mark.slow) for n in range(QUICK, FLIGHTS))],
 )
-def test_nothing_leaves_after_a_take_over(seed: int) -> None:
+def test_nothing_is_sent_after_a_pilot_takes_over(seed: int) -> None:
     """After a request of ours, or in a phase, the pilot selects a mode or disarms, and perhaps
     switches back. Some links lose one datagram in twenty."""
     chance, on = random.Random(seed), (px4, copter)[seed % 2]
@@ -122,7 +122,7 @@ def test_nothing_leaves_after_a_take_over(seed: int) -> None:
         assert pair.companion.authority.standing is Standing.LOST or mode is None
 
 
-def test_a_hold_that_was_asked_for_on_the_ground_is_asked_for_again_in_flight() -> None:
+def test_hold_requested_on_the_ground_is_requested_again_in_flight() -> None:
     """PX4 is in OFFBOARD since its last landing. In flight another program sends setpoints."""
     pair = px4.hop()
     setpoint = level_setpoint(0.5, 1, 195)
@@ -136,7 +136,7 @@ def test_a_hold_that_was_asked_for_on_the_ground_is_asked_for_again_in_flight() 
     assert landed_s - held_s == pytest.approx(2.1)
 
 
-def test_a_pilot_who_switches_back_between_two_heartbeats_is_not_asked_again() -> None:
+def test_mode_is_not_requested_again_after_a_pilot_switches_back() -> None:
     """PX4 sends no CURRENT_MODE, so that neither OFFBOARD nor the switch back may be reported."""
     pair = px4.hop(down=without(CURRENT_MODE))
     commander, judge = pair.instance.autopilot.commander, Judge(pair, px4)

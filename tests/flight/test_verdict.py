@@ -75,7 +75,7 @@ def achieves(pair: Pair, most_m: float) -> None:
     assert scored.max_truth_m == pytest.approx(true_m, abs=0.01)  # a step at 2 m/s
 
 
-def test_default_flight(px4_like: Pair) -> None:
+def test_default_flight_tracks_within_4_cm(px4_like: Pair) -> None:
     achieves(px4_like, 0.04)
 
 
@@ -115,7 +115,7 @@ def test_decisions_at_the_tilt_limit_are_counted_and_reported() -> None:
     assert texts["at a limit"].endswith(f"% of the decisions: {fixes}")
 
 
-def test_a_whole_flight_is_completed(flown: History) -> None:
+def test_whole_flight_is_completed(flown: History) -> None:
     whole = score(flown)
     assert (whole.completed, whole.ended_by) == (1.0, "reference over")
     assert whole.tracked_s == pytest.approx(3.0, abs=0.2)
@@ -124,7 +124,7 @@ def test_a_whole_flight_is_completed(flown: History) -> None:
     assert "at a limit" not in summary(whole, flown)
 
 
-def test_a_flight_is_not_completed_that_is_not_tracked_landed_and_disarmed(flown: History) -> None:
+def test_completed_flight_must_track_land_and_disarm(flown: History) -> None:
     records, heartbeat = flown.records, flown.heartbeat.copy()
     since_s = records["time_s"] - track_begin_s(flown)
     heartbeat["armed"][-1] = 1
@@ -141,7 +141,7 @@ def test_a_flight_is_not_completed_that_is_not_tracked_landed_and_disarmed(flown
         assert (scored.completed, scored.ended_by.startswith(why)) == (0.0, True), scored.ended_by
 
 
-def test_a_flight_that_was_at_the_ground_in_between_is_not_completed() -> None:
+def test_flight_with_ground_contact_is_not_completed() -> None:
     """Without thrust for 0.9 s the vehicle falls 3 m, bounces, and flies on. The time is too short
     for any row of the failsafe, and the outcome is "flown and landed"."""
     fault = {"fault": "motors_cut", "after": "engaged", "at_s": 10.0, "for_s": 0.9}
@@ -152,7 +152,7 @@ def test_a_flight_that_was_at_the_ground_in_between_is_not_completed() -> None:
     assert scored.completed == 0.0
 
 
-def test_a_restart_before_the_flight_is_none_of_it() -> None:
+def test_restart_before_the_flight_is_not_scored() -> None:
     """The stamps of its reports before the restart, in the air, occur again in the flight.
     Regression: both were mixed, and by the score a flight ended 3.3 m above the take-off point."""
     restarts = {"fault": "reboot", "after": "boot", "at_s": 1.0}
@@ -164,7 +164,7 @@ def test_a_restart_before_the_flight_is_none_of_it() -> None:
     assert (score(logged).completed, score(logged).ended_by) == (1.0, "reference over")
 
 
-def test_a_log_with_parts_missing_is_scored_as_far_as_it_goes(flown: History) -> None:
+def test_log_without_a_needed_message_has_a_nan_error(flown: History) -> None:
     whole = score(flown)
     assert whole.rmse_position_m < 0.05
     for part in ("position", "attitude", "setpoint", "reference"):
@@ -175,7 +175,7 @@ def test_a_log_with_parts_missing_is_scored_as_far_as_it_goes(flown: History) ->
     assert score(replace(flown, reference=twice)).rmse_position_m == whole.rmse_position_m
 
 
-def test_a_reference_that_stands_still_explains_no_motion(flown: History) -> None:
+def test_hover_reference_explains_no_motion(flown: History) -> None:
     """Regression: rounding in its derivatives explained some motion, depending on its position."""
     moved = flown.reference.copy()
     moved["position_ned_m"] += 1 / 3
@@ -183,7 +183,7 @@ def test_a_reference_that_stands_still_explains_no_motion(flown: History) -> Non
     assert told[0] == told[1] > 0.0
 
 
-def test_others_on_the_link_and_impossible_values_have_no_effect(flown: History) -> None:
+def test_foreign_senders_and_impossible_values_have_no_effect(flown: History) -> None:
     """With `--system 1` these senders are ignored: another autopilot, heard first; its companion
     with our component id; a ground station with the vehicle's ids; a camera of the same system. So
     are frames of the vehicle with a correct checksum and impossible values, each before a true one.
@@ -228,7 +228,7 @@ def test_others_on_the_link_and_impossible_values_have_no_effect(flown: History)
     assert [event.what for event in pair.history().modes] == [event.what for event in flown.modes]
 
 
-def test_a_requirement_on_a_cut_log_is_missed(tmp_path: Path) -> None:
+def test_requirement_on_a_truncated_log_is_missed(tmp_path: Path) -> None:
     """The log ends in the middle of the track, as after a crash of the computer. Without a
     requirement it is scored."""
     frames = calm_hover().logged
@@ -274,7 +274,7 @@ def reporting(height_m: float, down_mps: float, changing_mps: float) -> Touchdow
     return landing
 
 
-def test_landings_and_falls() -> None:
+def test_touchdown_tells_landings_from_falls() -> None:
     """The expected speed is sqrt(v^2 + 2 g h)."""
     soft, hard = touchdown(noise_mps=0.15), touchdown(2.8)
     assert soft.speed_mps == pytest.approx(0.7, abs=0.5)
@@ -291,7 +291,7 @@ def test_landings_and_falls() -> None:
         assert landing.not_landed(on_ground=True) == says
 
 
-def test_the_outcome_follows_the_log(flown: History) -> None:
+def test_exit_code_0_needs_a_completed_flight(flown: History) -> None:
     """For `fly`, `compare` and the fixture, exit code 0 needs a completed flight."""
     landed, refused = Outcome(0, "flown and landed"), Outcome(3, "not ready")
     completed, fallen = score(flown), Score(completed=0.0, ended_by="fell at up to 5.1 m/s")
@@ -303,7 +303,7 @@ def test_the_outcome_follows_the_log(flown: History) -> None:
     assert verdict(ended) == "not completed (mode change): the vehicle left OFFBOARD"
 
 
-def test_a_record_says_what_was_sent(px4_like: Pair) -> None:
+def test_decision_records_equal_the_sent_setpoints(px4_like: Pair) -> None:
     """Identification steps change the command after the decision, which then has no certificate."""
     flown = px4_like.history()
     excited = flown.records["phase"] == Phase.EXCITE.code
