@@ -227,7 +227,7 @@ def test_live_page_is_readable_and_follows_the_flight(shown: Shown) -> None:
     assert opened.problems == opened.fetched == []
 
 
-def test_json_lines_are_one_object_each(shown: Shown) -> None:
+def test_json_lines_contain_announcements_and_snapshots(shown: Shown) -> None:
     assert shown.lines[0] == {"type": "preparation", "text": "preparing"}
     told = [each["text"] for each in shown.lines if each["type"] == "announcement"]
     assert told == shown.pair.companion.announced

@@ -176,14 +176,14 @@ def landed_by_its_failsafe(pair: Pair) -> None:
     assert len(pair.landings) > 3
 
 
-def the_pilots(pair: Pair) -> None:
+def keeps_loiter(pair: Pair) -> None:
     assert pair.mode == "AUTO.LOITER"
 
 
-def the_pilots_while_landing(pair: Pair) -> None:
+def silent_after_the_pilot(pair: Pair) -> None:
     """Nothing is requested, and no setpoint sent, once a HEARTBEAT (1 Hz) has shown the pilot's
     mode."""
-    the_pilots(pair)
+    keeps_loiter(pair)
     since_s = begun_s(pair, Phase.LAND) + 2.6
     assert sum(at_s > since_s for at_s, _, _ in pair.sent) > 10
     assert sent_after(pair, since_s) == []
@@ -482,7 +482,7 @@ ROWS = {
     ),
     # the pilot
     "pilot takes over the landing while a failsafe shows": aborts(
-        Phase.FAILED, "not landed and disarmed after 20 s", the_pilots_while_landing, armed=True,
+        Phase.FAILED, "not landed and disarmed after 20 s", silent_after_the_pilot, armed=True,
         fly=partial(px4.hover, HIGH), limits={"land_s": 20.0},
         at=[
             *then(Phase.HOVER, 0.2, faults.downlink(faults.heartbeats(system_status=5))),
@@ -491,11 +491,11 @@ ROWS = {
     ),
     "pilot takes over the landing behind a link that has become 4 s late": aborts(
         Phase.YIELDED, "no telemetry for 1.0 s .*; the vehicle left AUTO.LAND for AUTO.LOITER",
-        the_pilots, fly=partial(px4.hover, HIGH), armed=True,
+        keeps_loiter, fly=partial(px4.hover, HIGH), armed=True,
         at=[*then(Phase.HOVER, 0.2, late_both_ways), *then(Phase.LAND, 5.5, Pair.pilot_takes_over)],
     ),
     "pilot takes over while arming": aborts(
-        Phase.YIELDED, "the vehicle left OFFBOARD for AUTO.LOITER as it armed", the_pilots,
+        Phase.YIELDED, "the vehicle left OFFBOARD for AUTO.LOITER as it armed", keeps_loiter,
         armed=True, at=then(Phase.ARM, 0.0, Pair.pilot_takes_over),
     ),
     "motors cut in flight": ends(

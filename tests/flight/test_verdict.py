@@ -91,7 +91,7 @@ def test_default_flight_tracks_within_4_cm(px4_like: Pair) -> None:
         ("gusts", 0.06),
     ],
 )
-def test_default_flight_in_other_scenarios(scenario: str, most_m: float) -> None:
+def test_default_flight_tracks_well_in_other_scenarios(scenario: str, most_m: float) -> None:
     """All scenarios are flown with the same configuration."""
     achieves(default_flight(scenario), most_m)
 

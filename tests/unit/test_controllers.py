@@ -31,7 +31,7 @@ ENDS = ("minimum", "exclusiveMinimum", "maximum")  # of a JSON schema
 RANGED = re.compile(r"^(\w+): [-\d.]+ .*# .*?(-?[\d.]+) \.\. ([\d.]+)", re.MULTILINE)
 
 
-def test_every_law_has_a_shipped_file_and_every_file_a_law() -> None:
+def test_laws_and_shipped_controller_files_correspond() -> None:
     files = set(shipped.names("controller"))
     assert set(names()) == files - {"paper_integral", "paper_limited"}
 

@@ -220,7 +220,7 @@ def test_undetermined_constants_are_refused():
     assert "1.5 s of flight, 2 s are needed" in short.refusals["tilt"]
 
 
-def test_last_rows_are_kept_and_cleaned():
+def test_newest_rows_are_kept_and_cleaned():
     stamps = [0.0, 0.1, 0.1, 0.05, 0.2, 0.3]
     north = [1.0, 2.0, 3.0, 9.0, math.nan, 4.0]
     kept = Rows(5, capacity=6)

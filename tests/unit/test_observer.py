@@ -293,7 +293,7 @@ def test_old_and_repeated_messages_are_dropped() -> None:
     assert np.array_equal(before.position_ned_m, after.position_ned_m)
 
 
-def test_position_older_than_the_attitude_is_used_at_its_own_time() -> None:
+def test_late_position_is_used_at_its_own_time() -> None:
     """A position stamped 8 ms before the newest attitude causes no error of 24 mm at 3 m/s."""
     observer, tilt = Observer(NO_DELAY), -1.02 * 3.0 / G
     observer.on_command(0.0, command(tilt, 0.0))

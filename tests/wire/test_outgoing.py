@@ -149,7 +149,7 @@ def test_log_records_use_separate_sequence_numbers() -> None:
 
 
 @pytest.mark.parametrize("length", [0, 50, 51, 100, 101, 999])
-def test_long_texts_are_joined_again(length: int) -> None:
+def test_long_texts_are_sent_in_chunks_and_rejoined(length: int) -> None:
     text = "".join(str(place % 10) for place in range(length))
     session, assembler = pinned(Sender(7)), TextAssembler()
     frames = [session.encode(chunk) for chunk in chunks(4, text, 7)]

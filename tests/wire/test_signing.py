@@ -271,7 +271,7 @@ def test_px4_without_a_clock_follows_received_stamps() -> None:
     assert heard(client, instance)
 
 
-def test_setup_signing_sets_and_removes_the_key_but_not_while_armed() -> None:
+def test_setup_signing_changes_the_key_only_while_disarmed() -> None:
     instance, client = vehicle(key=b""), station(b"")
 
     def set_up(sender: Sender, key: bytes, stamp: int) -> None:

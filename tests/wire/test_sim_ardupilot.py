@@ -214,7 +214,7 @@ def test_nan_thrust_counts_as_zero_and_prevents_arming() -> None:
         (1, LAND, ["EKF variance", "EKF Failsafe: changed to LAND Mode", "EKF Failsafe Cleared"]),
     ],
 )
-def test_without_gps_the_position_is_lost_after_eight_seconds(
+def test_arducopter_loses_its_position_8_s_after_gps_loss(
     action: int, mode: int, texts: list[str]
 ) -> None:
     vehicle = guided(FS_EKF_ACTION=action)
@@ -404,7 +404,7 @@ def test_arducopter_faces_a_region_of_interest_and_streams_its_goal() -> None:
     assert off_deg(bench, 0.0) < 20.0  # it turns to the place again
 
 
-def test_a_requested_speed_holds_until_a_setpoint_of_another_kind() -> None:
+def test_requested_speed_holds_until_another_kind_of_setpoint() -> None:
     """4 m/s were requested on the way, and the real one flew 4.1."""
     bench = flying()
 

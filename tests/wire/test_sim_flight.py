@@ -98,7 +98,7 @@ def test_setpoints_slower_than_1_hz_trigger_the_failsafe() -> None:
     assert "Failsafe activated" in bench.texts()
 
 
-def test_arming_needs_a_battery_and_with_nav_dll_act_a_ground_station() -> None:
+def test_arming_needs_battery_and_a_required_ground_station() -> None:
     bench = Bench(heartbeat_type=None)
     bench.set("NAV_DLL_ACT", 1)
     bench.run(5.0)

@@ -95,7 +95,7 @@ def test_messages_for_others_are_forwarded_between_the_links() -> None:
 # -- rates -----------------------------------------------------------------------------------
 
 
-def test_each_link_has_the_rates_of_px4_and_its_own_sequence() -> None:
+def test_each_link_has_px4_rates_and_its_own_sequence() -> None:
     """Each datagram contains whole frames."""
     bench = Bench(ground_link=True)
     bench.send(mavlink.MAVLink_param_request_list_message(1, 1))
