@@ -102,6 +102,9 @@ def senders(seen: Observation) -> Iterable[Finding]:
     for sender in seen.senders.found:
         peers = sender.peers
         if sender.ids == _ids(seen):
+            if sender.shared:
+                shared = "another program sends with the ids of the vehicle, system {} component {}"
+                yield warn(shared.format(*sender.ids), "give it another component id")
             peers = peers - {peer_name(seen.session.peer)}
         if peers:
             places = f", from {', '.join(sorted(peers))}" if sender.is_autopilot else ""
@@ -146,7 +149,8 @@ def loss(seen: Observation) -> Iterable[Finding]:
     received, share = senders.splitter, 0.0
     damaged = received.bytes_skipped / max(received.bytes_received, 1)
     figures = f"{damaged:.1%} of the bytes damaged"
-    if len(sender.peers) == 1:  # two addresses may be two vehicles, or a vehicle that changed port
+    # else two programs may count, or one vehicle that has changed its port
+    if len(sender.peers) == 1 and not sender.shared:
         lost = senders.lost(sender)
         share = lost / (sender.frames + lost)
         figures = f"{share:.1%} of the frames lost, {figures}"
@@ -269,8 +273,10 @@ def gps(seen: Observation) -> Iterable[Finding]:
     found = names.get(fix_type, f"fix type {fix_type}")
     report = seen.vehicle.estimator
     if report and not report.problem:
-        hint = "check that it has another source"
-        yield warn(f"{found}; the estimator still has a position", hint)
+        hints = "check that it has another source", seen.dialect.without_gps
+        yield warn(
+            f"{found}; the estimator still has a position", ", and ".join(filter(None, hints))
+        )
     elif fix_type == 0:
         yield wait(found, "wait if the vehicle has just started, else connect a GPS")
     else:

@@ -58,7 +58,7 @@ _PEERS_MAX, _SENDERS_MAX = 16, 64  # limits of memory if addresses or ids flood 
 @dataclass(slots=True)
 class Sender:
     """One MAVLink sender. `heartbeat` is its newest HEARTBEAT, or None; `peers` are the addresses
-    that it sends from, as text."""
+    that it sends from, as text. `shared`: whether an autopilot and another program have its ids."""
 
     system_id: int
     component_id: int
@@ -66,6 +66,7 @@ class Sender:
     peers: set[str] = field(default_factory=set)
     frames: int = 0
     times: int = 0  # number of TIMESYNC and SYSTEM_TIME messages
+    shared: bool = False
 
     @property
     def ids(self) -> tuple[int, int]:
@@ -111,7 +112,8 @@ class Senders:
             sender.peers.add(peer_name(peer))
         sender.times += frame.message_id in _TIMES
         if frame.message_id == HEARTBEAT:
-            sender.heartbeat = frame.message
+            before, sender.heartbeat = sender.heartbeat, frame.message
+            sender.shared |= before is not None and is_vehicle(before) != sender.is_autopilot
         for key in (ids, ids[:1]):
             gap = (frame.sequence - self._sequences.get(key, frame.sequence - 1) - 1) % 256
             self._lost[key] += gap if gap < 128 else 0  # a larger gap is a frame out of order

@@ -2,8 +2,10 @@
 beginning of the flight, the jumps and drift of this estimate, and the hover thrust.
 
 PX4 continues to follow attitude setpoints when its GPS is lost, and reports a position that drifts
-away: by 0.5 m in the first second, 10 m in 15 s. Only what was there at the beginning can be lost,
-because a vehicle may fly by motion capture or optical flow, without GPS.
+away: by 0.5 m in the first second, 10 m in 15 s. When motion capture is lost, both autopilots
+report a valid position for 5 to 7 s more; but the innovation ratios of their estimators repeat
+exactly. Only what was there at the beginning can be lost, because a vehicle may fly by motion
+capture or optical flow, without GPS.
 
 Jumps are resets of the vehicle's estimator. They are found without a message about them
 (ODOMETRY.reset_counter exists on PX4 only): two positions some milliseconds apart that are too far
@@ -46,6 +48,7 @@ class Positioning:
 
     had_fix: bool = False
     report: EstimatorReport | None = None
+    measured: bool = False  # whether the estimator used GPS or external vision
     fixes_silent_s: float = math.inf  # GPS_RAW_INT is missing after this time without a fix
     reports_silent_s: float = math.inf  # the same for EstimatorReport
 
@@ -56,6 +59,7 @@ class Positioning:
         self.fixes_silent_s = _silent_s(rates_hz.get("GPS_RAW_INT", 0.0))
         if vehicle.age_s(EstimatorReport) < KNOWN_S:
             self.report = vehicle.estimator
+            self.measured = vehicle.unmeasured_s < KNOWN_S
             self.reports_silent_s = _silent_s(rates_hz.get(estimator, 0.0))
 
     def lost(self, vehicle: VehicleState, limits: Limits) -> str:
@@ -75,6 +79,9 @@ class Positioning:
                 return "its estimator reports no accuracy of the position any more"
             if now.accuracy_m > max(limits.accuracy_m, WORSE * before.accuracy_m):
                 return f"its estimated position is only accurate to {now.accuracy_m:.1f} m"
+        if self.measured and vehicle.unmeasured_s > limits.gps_s:
+            for_s = vehicle.unmeasured_s
+            return f"its estimator has used neither GPS nor an external position for {for_s:.1f} s"
         if vehicle.age_s(EstimatorReport) > self.reports_silent_s:
             return "no report of its estimator"
         return ""

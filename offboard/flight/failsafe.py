@@ -134,8 +134,8 @@ def estimate_contradicts(flight: FlightState) -> str:
 
 
 def positioning_lost(flight: FlightState) -> str:
-    """Loss, since take-off, of the GPS fix, of a valid or accurate position estimate, or of the
-    messages that report them."""
+    """Loss, since take-off, of the GPS fix or external vision, of a valid or accurate position
+    estimate, or of the messages that report them."""
     return flight.positioning.lost(flight.vehicle, flight.limits)
 
 

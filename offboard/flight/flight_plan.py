@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 # limits of the reference while it returns after a jump of the estimate
 RETURN = Limits(speed_mps=0.5, acceleration_mps2=0.5, cruise_mps=0.5, cruise_vertical_mps=0.5)
 CLEAR_M = 0.5  # least height above the ground of a track that is placed in the air
+SINKS_MPS = 0.3  # a vehicle that sinks faster does not hover
 SAMPLED_S = 0.1  # interval at which the height of the track is sampled
 
 
@@ -120,9 +121,11 @@ class FlightPlan:
         places = self.track.sample(times_s).position_ned_m
         origin = stopping_place(position_ned_m, velocity_ned_mps) - places[0]
         lowest_m = float(origin[2]) + float(places[:, 2].max())
-        # if the vehicle itself is nearer to the ground, its height is allowed
-        clear_m = -math.inf if ground_down_m is None else ground_down_m - CLEAR_M
-        least_m = max(clear_m, position_ned_m[2])
+        least_m = position_ned_m[2]
+        if ground_down_m is not None:
+            clear_m = ground_down_m - CLEAR_M
+            # a vehicle that hovers lower shows how low is safe; one that is landing does not
+            least_m = clear_m if velocity_ned_mps[2] > SINKS_MPS else max(clear_m, least_m)
         above_m = max(lowest_m - least_m, 0.0)
         self.origin_ned_m = (float(origin[0]), float(origin[1]), float(origin[2]) - above_m)
         return above_m

@@ -151,7 +151,7 @@ class Limits(Parameters):
     link_growth_s: float = Field(default=0.3, gt=0, le=2)  # of the link's delay since take-off
     missed_decisions: int = Field(default=3, ge=1, le=100)  # in a row
     position_error_m: float = Field(default=5.0, ge=0.1, le=100)
-    gps_s: float = Field(default=1.0, ge=0.5, le=600)  # without the GPS fix it took off with
+    gps_s: float = Field(default=1.0, ge=0.5, le=600)  # without the GPS fix or vision it had
     accuracy_m: float = Field(default=3.0, ge=0.5, le=100)  # of the position, by the vehicle
     position_jump_m: float = Field(default=2.0, ge=0.3, le=100)  # of the estimate, in 10 s
     hover_thrust: float = Field(default=0.9, ge=0.05, le=1)  # normalised thrust that hovers

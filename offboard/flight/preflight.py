@@ -311,6 +311,10 @@ def _other_mode(ground: Ground) -> str:
     return f"select {mode}, as `offboard fly` does first"
 
 
+def _remedy(ground: Ground) -> str:
+    return ground.dialect.remedy(ground.vehicle.texts) if ground.dialect else ""
+
+
 def _no_estimate(ground: Ground) -> str:
     report = ground.vehicle.estimator
     return report.problem if report else ""
@@ -383,13 +387,13 @@ PREFLIGHT = (
     Row("senders", BLOCKS, _several_vehicles, _CHOOSE, at_once=True),
     Row("senders", BLOCKS, _same_system_id, _SAME_ID, at_once=True),
     Row("senders", BLOCKS, twin, _ONE_WAY),
-    Row("rates", WAIT, _no_telemetry),
+    Row("rates", WAIT, _no_telemetry, _remedy),
     Row("supervisor", WAIT, _unguarded),
     Row("rates", BLOCKS, _slow, _slow_hint),
     Row("state", BLOCKS, _landed_unknown),
     Row("parameters", WAIT, _reading),
     Row("origin", WAIT, _origin),
-    Row("prearm", WAIT, _prearm, fly_only=True),
+    Row("prearm", WAIT, _prearm, _remedy, fly_only=True),
     Row("prearm", WARN, _needs_setpoints, _other_mode, fly_only=True),
     Row("estimator", _estimate_level, _no_estimate, _ESTIMATOR),
     Row("battery", BLOCKS, _empty_battery, "charge the battery"),

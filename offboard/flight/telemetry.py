@@ -45,6 +45,7 @@ from offboard.mavlink.events import (
     VehicleIdentity,
 )
 from offboard.mavlink.outgoing import CommandResult
+from offboard.mavlink.senders import AUTOPILOT_COMPONENT
 
 START, PAUSE_CONTINUE, SET_MODE = 300, 193, 176  # MAV_CMD
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)  # MAV_RESULT
@@ -52,6 +53,10 @@ SAME_THRUST = 1e-5  # of full throttle: rounding on the link
 OTHER_COMPANION = (
     "another companion computer is on the link: system {system} component {component}; only one of "
     "them may send setpoints"
+)
+SAME_IDS = (
+    "another program sends with the ids of the vehicle, system {system} component {component}: "
+    "give it another component id"
 )
 DISARMED_SHOWN = (
     "a HEARTBEAT shows the vehicle disarmed: either it is wrong, or the motors have stopped"
@@ -91,7 +96,10 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
         case PeerChanged(peer):
             outbox.announce(flight, f"the vehicle now sends from another port: {peer_name(peer)}")
         case OtherCompanion(system, component):
-            sentence = OTHER_COMPANION.format(system=system, component=component)
+            same = component == AUTOPILOT_COMPONENT
+            sentence = (SAME_IDS if same else OTHER_COMPANION).format(
+                system=system, component=component
+            )
             outbox.announce(flight, sentence, once=True)
         case ClockBehind(system_id, _):  # it sets its time stamp to ours when it hears us
             sentence = f"the signing time of system {system_id} is behind: sending ours"

@@ -204,8 +204,11 @@ def _conclude(flight: FlightState, row: Transition, reason: str) -> None:
 
 
 def _explanation(flight: FlightState) -> str:
-    dialect = flight.dialect
-    return flight.vehicle.explanation(dialect.unsaid if dialect else "")
+    dialect, vehicle = flight.dialect, flight.vehicle
+    if dialect is None:
+        return vehicle.explanation("")
+    fix = dialect.remedy(vehicle.texts)
+    return vehicle.explanation(dialect.unsaid) + (fix and f". Fix: {fix}")
 
 
 def _begin_climb(flight: FlightState, source: Phase) -> None:

@@ -70,6 +70,7 @@ class VehicleState:
     other_companion: OtherCompanion | None = None
     armed_changed_s: float = -math.inf  # link time; infinite until it was first seen armed
     resumed_s: float = -math.inf  # vehicle time of the first telemetry after an outage
+    measured_s: float = -math.inf  # when an EstimatorReport last showed other horizontal ratios
     now_s: float = 0.0
     heard_s: dict[type, float] = field(default_factory=dict)  # link time, by type of event
     # components of position and velocity, each with the stamp since which it has not changed
@@ -91,6 +92,13 @@ class VehicleState:
     def attitude_age_s(self) -> float:
         """The same as `position_age_s`, for the attitude."""
         return self._age_s(self.attitude)
+
+    @property
+    def unmeasured_s(self) -> float:
+        """For how long the horizontal innovation ratios have been exactly the same: the estimator
+        uses neither GPS nor an external position. Optical flow does not change them. Infinite if
+        no two reports differed."""
+        return self.heard_s.get(EstimatorReport, -math.inf) - self.measured_s
 
     @property
     def disarmed_s(self) -> float:
@@ -191,6 +199,8 @@ class VehicleState:
             case SystemHealth():
                 self.health = event
             case EstimatorReport():
+                if self.estimator and event.horizontal_ratios != self.estimator.horizontal_ratios:
+                    self.measured_s = now_s
                 self.estimator = event
             case Landed(state):
                 self.landed = state

@@ -44,16 +44,16 @@ _RESULTS |= {6: "CANCELLED", 9: "COMMAND_UNSUPPORTED_MAV_FRAME", 10: "NOT_IN_CON
 _PX4_ESTIMATOR, _ARDUPILOT_ESTIMATOR = 230, 193
 _RATIOS = {
     _PX4_ESTIMATOR: {
-        "GPS velocity": "vel_ratio",
-        "GPS position": "pos_horiz_ratio",
+        "velocity": "vel_ratio",
+        "horizontal position": "pos_horiz_ratio",
         "height": "pos_vert_ratio",
         "heading": "mag_ratio",
         "height above ground": "hagl_ratio",
         "airspeed": "tas_ratio",
     },
     _ARDUPILOT_ESTIMATOR: {
-        "GPS velocity": "velocity_variance",
-        "GPS position": "pos_horiz_variance",
+        "velocity": "velocity_variance",
+        "horizontal position": "pos_horiz_variance",
         "height": "pos_vert_variance",
         "compass": "compass_variance",
         "terrain": "terrain_alt_variance",

@@ -17,6 +17,7 @@ WARNING, NOTICE = 4, 5  # MAV_SEVERITY; more severe is a lower number
 # longest age of a report of the mode that allows a setpoint or a command; HEARTBEAT comes at 1 Hz
 MODE_KNOWN_S = 2.5
 GOOD_RESULTS = ("ACCEPTED", "IN_PROGRESS")  # MAV_RESULT
+HORIZONTAL = "velocity", "horizontal position"  # measurements of an EstimatorReport
 ESTIMATE = ("attitude", "horizontal velocity", "horizontal position", "height")  # parts needed
 
 
@@ -131,6 +132,10 @@ class EstimatorReport(Event):
     ratios: tuple[tuple[str, float], ...]
     # horizontal standard deviation; None: not reported, or not finite
     accuracy_m: float | None = None
+
+    @property
+    def horizontal_ratios(self) -> list[float]:
+        return [ratio for name, ratio in self.ratios if name in HORIZONTAL]
 
     @property
     def worst(self) -> tuple[str, float]:

@@ -39,6 +39,7 @@ ENOUGH = 0.7  # of the wanted rate: the window has few samples of a slow message
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 3.0, 30.0  # between two requests for a message
 _OPTIONAL_TRIES = 2
 _STOPPED_S = 0.2  # a fast message that is missing for this time was stopped, or all are lost
+_STOPPED_WAIT_S = 1.0  # between two requests for it: a ground station may stop it every few seconds
 _UNHEARD = 0.1  # of the wanted rate: a message that arrives more rarely has its default rate
 # ArduCopter denies rates above 0.8 SCHED_LOOP_RATE. Its COMMAND_ACK does not name the message, and
 # is the same for unknown messages; this STATUSTEXT names the message
@@ -218,12 +219,14 @@ class _Stream:
         return True
 
     def _again(self, waited_s: float, now_s: float) -> bool:
-        if waited_s < _FIRST_WAIT_S:
+        if waited_s < _STOPPED_WAIT_S:
             return False
         rate_hz, enough_hz = self.rate_hz(now_s), ENOUGH * self.wanted.arrives_hz
         fast = rate_hz > 0.0 and self.wanted.arrives_hz > SLOW_HZ
         if fast and now_s - self.arrivals_s[-1] > _STOPPED_S:
             return True  # without waiting longer, so that the flight does not end because of it
+        if waited_s < _FIRST_WAIT_S:
+            return False
         if 0.0 < rate_hz < min(_UNHEARD * self.wanted.rate_hz, enough_hz):
             return True  # it still has its default rate: the link has lost the requests
         if waited_s < self.wait_s:

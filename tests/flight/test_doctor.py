@@ -295,10 +295,10 @@ FOUND: list[tuple[Any, ...]] = [
        "Fix: select AUTO.LOITER, as `offboard fly` does first")),
     # its estimator: 3 m/s are twice the gate of 1.5 m/s
     ({"faults": [REJECTED]},
-     ("estimator", BLOCKS, r"rejects GPS velocity \(innovation ratio 2.00, limit 1\)"),
+     ("estimator", BLOCKS, r"rejects velocity \(innovation ratio 2.00, limit 1\)"),
      ("prearm", WAIT, "unhealthy by SYS_STATUS: RC_RECEIVER")),
     ({"firmware": ARDUPILOT, "faults": [REJECTED]},
-     ("estimator", BLOCKS, r"rejects GPS velocity \(innovation ratio 2.00, limit 1\)"),
+     ("estimator", BLOCKS, r"rejects velocity \(innovation ratio 2.00, limit 1\)"),
      ("prearm", WAIT, "EKF velocity variance")),
     # other programs on the link
     (beside(AUTOPILOT_HEARTBEAT, 1, 1, 1.0, ("::1", 14999, 0, 0)),
@@ -308,6 +308,9 @@ FOUND: list[tuple[Any, ...]] = [
     (beside(SETPOINT, 1, 191, place=SAME_PLACE), ("senders", BLOCKS, "component 191")),
     (beside(GCS_HEARTBEAT, 255, 190, 1.0),
      ("senders", OK, "other senders: ground station 255/190")),
+    (beside(GCS_HEARTBEAT, 1, 1, 1.0, place=SAME_PLACE),
+     ("senders", WARN, "another program sends with the ids of the vehicle, system 1 component 1"),
+     ("loss", OK, "^0.0% of the bytes damaged")),
     (beside(TIME, 255, 190, 2.0), ("clock", WARN, "another time master: component 255/190")),
     # the link
     (link(latency_s=0.3), ("delay", BLOCKS, "the delay of the link is")),

@@ -180,6 +180,15 @@ def accuracy(flight: FlightState, accuracies_m: tuple[float | None, float | None
     hear(flight, replace(reported, accuracy_m=accuracies_m[1]))
 
 
+def repeats(flight: FlightState, for_s: float) -> None:
+    """The innovation ratios of motion capture change, and then stay the same."""
+    reports = [EstimatorReport(frozenset(ESTIMATE), (("velocity", each),)) for each in (0.1, 0.2)]
+    for report, ago_s in zip((*reports, reports[1]), (for_s + 0.5, for_s, 0.0), strict=True):
+        flight.vehicle.update(report, NOW_S - ago_s)
+        if ago_s:
+            flight.positioning.begin(flight.vehicle, {}, "EKF_STATUS_REPORT")
+
+
 def no_fix(flight: FlightState, for_s: float) -> None:
     hear(flight, GpsFix())
     flight.positioning.begin(flight.vehicle, {"GPS_RAW_INT": 5.0}, "")
@@ -253,6 +262,7 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("positioning", accuracy, (None, None), (0.5, None)),
     ("positioning", valid, frozenset(ESTIMATE), frozenset(ESTIMATE[:1])),
     ("positioning", no_fix, 1.0, 2.1),
+    ("positioning", repeats, 1.0, 1.1),
     ("volume", lambda flight, height_m: at(flight, 0.0, -height_m), 120.0, 120.1),
     ("volume", lambda flight, away_m: at(flight, away_m, -1.0), 1000.0, 1000.1),
     ("battery", lambda flight, left: hear(flight, SystemHealth(True, left)), 0.1, 0.09),

@@ -94,6 +94,10 @@ def says_who_is_on_the_link(pair: Pair) -> None:
     assert said(pair, "another companion computer is on the link: system 1 component 191")
 
 
+def says(pair: Pair, words: str) -> None:
+    assert said(pair, words)
+
+
 def says_nobody_is_on_the_link(pair: Pair) -> None:
     assert not said(pair, "another companion computer")
 
@@ -181,6 +185,7 @@ FAILSAFE, IDS, ENGAGED = (
 )
 NO_GPS = scenario_of({"fault": "silent_message", "message": "GPS_RAW_INT"})
 WAITS = another_companion(setpoint_rate_hz=0, custom_mode=Phase.HEALTH.code)
+SAME_IDS = another_companion(component=1, setpoint_rate_hz=0, custom_mode=0)
 FLIES_ANOTHER = another_companion(system=2, setpoint_rate_hz=0)
 ROWS = {
     # flights that end early. Before this row existed, a real PX4 and a real ArduCopter (in SITL)
@@ -283,6 +288,10 @@ ROWS = {
     # started by mistake on another port, with our ids; it is refused itself, as in other rows
     "another offboard waits on the link": flies(
         says_who_is_on_the_link, fly=copter.hover, scenario=WAITS, failsafes=()
+    ),
+    "another program with the ids of the vehicle": flies(
+        lambda pair: says(pair, "with the ids of the vehicle, system 1 component 1: give it"),
+        fly=copter.hover, scenario=SAME_IDS, failsafes=(),
     ),
     # regression: its HEARTBEAT, forwarded by a router, was taken for a second controller of ours
     "an offboard that flies another vehicle on the link": flies(

@@ -355,6 +355,10 @@ BOOTING_ARMED = faults.heartbeats(system_status=1, base_mode=209, custom_mode=0)
 HELICOPTER = config.vehicle("px4_sih").model_copy(update={"airframe": "helicopter"})
 HEALTH_IN_5_S, HEALTH_IN_8_S = {"health_s": 5.0}, {"health_s": 8.0}
 NO_TAKEOFF = Rule("takeoff", result=Result.FAILED)
+NO_ORIGIN = Rule(
+    "arm", result=Result.FAILED,
+    texts=(StatusText(Severity.CRITICAL, "Arm: AHRS: waiting for home"),),
+)  # fmt: skip
 LONG = (HIGH, "reference.duration_s=6.0")
 PX4_HOVERS, COPTER_HOVERS = partial(px4.hover, *LONG), partial(copter.hover, *LONG)
 LOITERS = faults.with_default("COM_OBL_RC_ACT", 5.0)  # without setpoints AUTO.LOITER, not POSCTL
@@ -406,6 +410,11 @@ ROWS = {
     "arming refused": refusal(
         "the vehicle did not arm in 15 s" + REJECTED.format(400), on_the_ground, asked_to_disarm,
         firmware=faults.refusing("arm", "Arming denied: no joystick"),
+    ),
+    "arming refused without GPS and origin": refusal(
+        "the vehicle did not arm in 15 s; the vehicle said: Arm: AHRS: waiting for home. "
+        "Fix: wait for a GPS fix, or without GPS set the origin", on_the_ground,
+        fly=copter.hop, firmware=replace(ARDUPILOT, rules=(NO_ORIGIN, *ARDUPILOT.rules)),
     ),
     "mode refused": refusal(
         r"the vehicle did not enter OFFBOARD in 10 s \(it shows AUTO.LOITER\)"

@@ -362,6 +362,11 @@ def test_low_reference_is_raised_clear_of_the_ground() -> None:
     raised_m = plan.place_start((3.0, 4.0, -1.0), REST, 0.0)
     assert raised_m == pytest.approx(max(falls_m - 1.0 + CLEAR_M, 0.0), abs=0.02)
     assert plan.place_start((3.0, 4.0, -20.0), REST, None) == pytest.approx(falls_m, abs=0.02)
+    for down_mps, lowest_m in ((0.2, 0.3), (0.5, CLEAR_M)):  # it hovers; it is landing
+        plan.place_start((3.0, 4.0, -0.3), (0.0, 0.0, down_mps), 0.0)
+        assert -plan.origin_ned_m[2] - falls_m - float(start[2]) == pytest.approx(
+            lowest_m, abs=0.05
+        )
 
 
 def test_repeated_pauses_while_stopping_count_as_one() -> None:

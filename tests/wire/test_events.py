@@ -122,7 +122,7 @@ def test_estimator_reports_name_their_problem() -> None:
     for flags, ratios, accuracy_m, problem in (
         (229, waiting, NAN, unfixed),
         (831, flying, 0.3, ""),
-        (831, wrong, 0.3, "rejects GPS velocity (innovation ratio 1.30, limit 1)"),
+        (831, wrong, 0.3, "rejects velocity (innovation ratio 1.30, limit 1)"),
     ):
         filled = (*ratios, *(NAN,) * (6 - len(ratios)))
         px4 = mavlink.MAVLink_estimator_status_message(10**6, flags, *filled, accuracy_m, 0.3)

@@ -80,6 +80,17 @@ def test_rate_is_requested_again_only_after_a_change() -> None:
     assert vehicle.requested_s[0] - 183.0 == pytest.approx(0.2, abs=0.03)
 
 
+def test_one_that_a_ground_station_slows_every_few_seconds_is_slow_for_half_a_second() -> None:
+    """As REQUEST_DATA_STREAM at 4 Hz does on ArduPilot."""
+    vehicle = Vehicle()
+    vehicle.run(10.0, 1)
+    for _ in range(5):
+        vehicle.requested_s.clear()
+        vehicle.run(0.5, 25)
+        assert len(vehicle.requested_s) == 1
+        vehicle.run(1.5, 1)
+
+
 @pytest.mark.parametrize(
     ("loop_hz", "default_hz", "position_from_s", "loss", "asked_hz"),
     [

@@ -42,6 +42,9 @@ _JERK = WatchedParameter(
 # Names of the parameters until 4.6 -> since 4.7
 _ACCELERATIONS = {"ATC_ACCEL_R_MAX": "ATC_ACC_R_MAX", "ATC_ACCEL_P_MAX": "ATC_ACC_P_MAX"}
 _RATES = "ATC_RATE_R_MAX", "ATC_RATE_P_MAX"
+_ORIGIN = (
+    "set the origin of its estimator (SET_GPS_GLOBAL_ORIGIN; Mission Planner: Set EKF Origin Here)"
+)
 _UNCHECKED = Valid("the vehicle arms without all of its checks", 1.0, 1.0, 1.0)
 
 # A parameter with `replaces` has this name since ArduCopter 4.7
@@ -147,6 +150,13 @@ ARDUPILOT = Dialect(
     slow_hint="another ground station may set the rates (MAVProxy: `set streamrate -1`), or the "
     "link is full",
     unsaid="see the ground station",
+    remedies=MappingProxyType(
+        {
+            "waiting for home": f"wait for a GPS fix, or without GPS {_ORIGIN}",
+            "is not neutral": "move the throttle stick down, the others to their centre",
+        }
+    ),
+    without_gps=_ORIGIN,
     oldest=(4, 3),
     setpoint_loss=lambda parameters: SetpointLoss(parameters.get("GUID_TIMEOUT", 3.0)),
     wanted=(

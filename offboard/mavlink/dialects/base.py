@@ -6,7 +6,7 @@ px4.py and ardupilot.py have the instances. No other code branches on the name o
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -171,11 +171,19 @@ class Dialect:
     oldest: tuple[int, int]  # oldest version that this dialect is made for
     # parameters -> what the vehicle does when setpoints stop; a missing one may have any value
     setpoint_loss: Callable[[Mapping[str, float]], SetpointLoss]
+    # part of a STATUSTEXT that names a problem -> what the user should do about it
+    remedies: Mapping[str, str] = field(default_factory=dict)
+    without_gps: str = ""  # what else the vehicle needs to fly without GPS, as an imperative
     # known defects of its firmware -> the version that fixes each, as (major, minor)
     defects: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def mode_name(self, custom_mode: int) -> str:
         return self.modes.get(custom_mode) or f"UNKNOWN(0x{custom_mode:08x})"
+
+    def remedy(self, texts: Iterable[str]) -> str:
+        """What to do about these texts of the vehicle; empty if they say it, or it is not known."""
+        told = "\n".join(texts)
+        return next((fix for part, fix in self.remedies.items() if part in told), "")
 
     def unanswered(self, known: Mapping[str, float]) -> list[WatchedParameter]:
         """The watched parameters for which no name of any release has had a reply."""
