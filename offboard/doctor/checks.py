@@ -211,9 +211,11 @@ def clock(seen: Observation) -> Iterable[Finding]:
     masters = [s.name for s in seen.senders.found if s.times and s.system_id != system_id]
     if seen.foreign_replies > FOREIGN_TIMES:
         masters.append(f"the sender of {seen.foreign_replies} requests that are answered here")
-    if masters:
-        hint = "let one program alone exchange TIMESYNC with the vehicle"
-        yield warn(f"another time master: {', '.join(masters)}", hint)
+    if len(masters) > 1:  # we do not answer the vehicle's requests, and one may
+        hint = "let one program alone answer the vehicle's TIMESYNC: that which sends it vision"
+        yield warn(f"several time masters: {', '.join(masters)}", hint)
+    elif masters:
+        yield ok(f"time master: {masters[0]}")
     rate = seen.clock.telemetry_rate
     if rate is not None:
         figures = f"the vehicle's clock runs {rate:.3f} times as fast as this computer's"

@@ -46,7 +46,7 @@ class Positioning:
     """What the position estimate had when the flight began, and what of it is lost. Before the
     flight nothing counts as lost."""
 
-    had_fix: bool = False
+    had_fix: bool = False  # which the estimator uses
     report: EstimatorReport | None = None
     measured: bool = False  # whether the estimator used GPS or external vision
     fixes_silent_s: float = math.inf  # GPS_RAW_INT is missing after this time without a fix
@@ -60,6 +60,7 @@ class Positioning:
         if vehicle.age_s(EstimatorReport) < KNOWN_S:
             self.report = vehicle.estimator
             self.measured = vehicle.unmeasured_s < KNOWN_S
+            self.had_fix &= self.report is None or self.report.by_gps
             self.reports_silent_s = _silent_s(rates_hz.get(estimator, 0.0))
 
     def lost(self, vehicle: VehicleState, limits: Limits) -> str:
@@ -81,7 +82,7 @@ class Positioning:
                 return f"its estimated position is only accurate to {now.accuracy_m:.1f} m"
         if self.measured and vehicle.unmeasured_s > limits.gps_s:
             for_s = vehicle.unmeasured_s
-            return f"its estimator has used neither GPS nor an external position for {for_s:.1f} s"
+            return f"its estimator has used neither GPS nor external vision for {for_s:.1f} s"
         if vehicle.age_s(EstimatorReport) > self.reports_silent_s:
             return "no report of its estimator"
         return ""

@@ -34,7 +34,7 @@ from offboard.flight.phases import (
 )
 from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, DISARMED_S
-from offboard.mavlink.events import Heartbeat
+from offboard.mavlink.events import GOOD_RESULTS, Heartbeat
 
 TAKE_OVER_HEIGHT_M = 1.0  # height at which setpoints replace the autopilot's own take-off
 DETECTOR_S = 1.0  # time for the land detector to report: EXTENDED_SYS_STATE is requested at 5 Hz
@@ -167,6 +167,16 @@ def failsafe_hold(flight: FlightState) -> bool:
     return flight.failsafe.action is Action.HOLD
 
 
+def hold_refused(flight: FlightState) -> str:
+    """The autopilot cannot hold: PX4 without a global position, as by motion capture, does not."""
+    assert flight.dialect is not None
+    hold = flight.dialect.hold()
+    result = flight.vehicle.results.get(hold.command, "ACCEPTED")
+    if hold not in flight.requested_s or result in GOOD_RESULTS:
+        return ""
+    return f"the vehicle refuses {flight.dialect.hold_mode} ({result})"
+
+
 def landed(flight: FlightState) -> bool:
     return not flight.vehicle.armed and not flight.not_landed()
 
@@ -265,6 +275,7 @@ TO_THE_END = (
     Transition({EXCITE}, not_identified, LAND, ABORTED),
     Transition({JOIN}, at_full_speed, TRACK, reason="on the reference at full speed"),
     Transition({TRACK}, track_over, HOVER, reason="the reference was flown"),
+    Transition({HOLD}, hold_refused, LAND, ABORTED),
     Transition({HOLD}, longer_than("hold_s"), LAND, ABORTED, reason=HELD),
     Transition({LAND}, landed, DISARMED, reason="disarmed on the ground"),
     Transition({LAND}, rebooted_disarmed, FAILED, ABORTED, "restart", RESTARTED),
@@ -277,6 +288,7 @@ TO_THE_END = (
 HANDED_BACK, NOT_BEGUN = "handed back on request", "stopped on request"
 hand_back, start = requested(Request.HAND_BACK), requested(Request.START)
 SERVICE_ENDS = (
+    Transition({HAND_BACK}, hold_refused, LAND, ABORTED),
     Transition({HAND_BACK}, longer_than("hand_back_s"), LAND, ABORTED, reason=DID_NOT_HOLD),
     Transition({TAKEOFF} | TRACKING, hand_back, HAND_BACK, FLOWN, reason=HANDED_BACK),
     Transition({STREAM, ENGAGE}, hand_back, FAILED, FLOWN, reason=NOT_BEGUN),

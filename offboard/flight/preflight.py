@@ -162,6 +162,12 @@ def not_ready(ground: Ground) -> str:
     return next(waiting, "")
 
 
+def only_mode_is_unfit(ground: Ground) -> bool:
+    """Whether only the pre-arm checks of the mode that PX4 shows do not pass, and PX4 uses no GPS:
+    without a global position AUTO.LOITER fails them, and OFFBOARD may pass."""
+    return _without_gps(ground) and {check for check, _, _ in findings(ground)} == {"prearm"}
+
+
 # --- conditions ---
 
 
@@ -315,6 +321,20 @@ def _remedy(ground: Ground) -> str:
     return ground.dialect.remedy(ground.vehicle.texts) if ground.dialect else ""
 
 
+def _without_gps(ground: Ground) -> bool:
+    report = ground.vehicle.estimator
+    return report is not None and not report.by_gps and not report.problem
+
+
+def _prearm_fix(ground: Ground) -> str:
+    if ground.dialect is None or not _without_gps(ground):
+        return _remedy(ground)
+    return (
+        f"`offboard fly` also tries {ground.dialect.engage_mode}, which needs no global position; "
+        f"it lands the vehicle if {ground.dialect.hold_mode} is refused in flight"
+    )
+
+
 def _no_estimate(ground: Ground) -> str:
     report = ground.vehicle.estimator
     return report.problem if report else ""
@@ -362,7 +382,10 @@ def _late(ground: Ground) -> str:
     )
 
 
-_ESTIMATOR = "wait for a GPS fix, keep the vehicle still and away from metal; then calibrate"
+_ESTIMATOR = (
+    "wait for a GPS fix, or check that external vision arrives (PX4: EKF2_EV_CTRL), keep the "
+    "vehicle still and away from metal; then calibrate"
+)
 _UNFIT = (
     "check MAV_TYPE or FRAME_CLASS, and airframe in the vehicle file; if they are right, fly it "
     "with its own autopilot"
@@ -393,9 +416,9 @@ PREFLIGHT = (
     Row("state", BLOCKS, _landed_unknown),
     Row("parameters", WAIT, _reading),
     Row("origin", WAIT, _origin),
-    Row("prearm", WAIT, _prearm, _remedy, fly_only=True),
-    Row("prearm", WARN, _needs_setpoints, _other_mode, fly_only=True),
     Row("estimator", _estimate_level, _no_estimate, _ESTIMATOR),
+    Row("prearm", WAIT, _prearm, _prearm_fix, fly_only=True),
+    Row("prearm", WARN, _needs_setpoints, _other_mode, fly_only=True),
     Row("battery", BLOCKS, _empty_battery, "charge the battery"),
     Row("delay", WAIT, _measuring),
     Row("delay", BLOCKS, _late, "use a faster link"),

@@ -27,6 +27,7 @@ from offboard.mavlink.events import Heartbeat
 ARM_DISARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
 ARMING_SHOWN_S = 2.5  # HEARTBEAT, at 1 Hz, shows an accepted arming within this time
 OTHER_VEHICLE_S = 5.0  # after a longer silence another vehicle may be on the link
+PREARM_S = 10.0  # time for the pre-arm checks of the mode that PX4 shows, without GPS
 LISTENED_S = 0.5  # time to hear another sender of setpoints: PX4 leaves OFFBOARD below 2 Hz
 
 
@@ -64,6 +65,14 @@ def unfit(flight: FlightState) -> str:
 
 def usable(flight: FlightState) -> bool:
     return not unfit(flight)
+
+
+def only_mode_is_unfit(flight: FlightState) -> str:
+    """See `preflight.only_mode_is_unfit`."""
+    if flight.in_phase_s <= PREARM_S or not preflight.only_mode_is_unfit(flight):
+        return ""
+    shown, engaged = flight.vehicle.mode, flight.authority.engage_mode
+    return f"its pre-arm checks do not pass in {shown}, but may pass in {engaged}"
 
 
 def not_ready(flight: FlightState) -> str:
@@ -244,6 +253,7 @@ FLY_BEGINS = (
     Transition({HEALTH}, stop_requested, FAILED, REFUSED, OPERATOR, BEFORE_TAKEOFF),
     Transition({HEALTH}, refused, FAILED, REFUSED),
     Transition({HEALTH}, usable, STREAM, reason="telemetry flows and the vehicle can arm"),
+    Transition({HEALTH}, only_mode_is_unfit, STREAM),
     Transition({HEALTH}, longer_than("health_s", not_ready), FAILED, REFUSED),
 )
 SERVICE_BEGINS = (

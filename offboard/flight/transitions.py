@@ -245,7 +245,8 @@ def _place_reference(flight: FlightState, position: LocalPosition) -> None:
     vehicle, at the height of its last rest. With the anchor "here" the reference starts where the
     vehicle stops; with "origin" it is relative to the last rest, or as in `fly` to `home_ned_m`."""
     contact, jumps = flight.contact, flight.jumps
-    flight.home_ned_m = (*jumps.without(position.position_ned_m)[:2], contact.rest_down_m)
+    below = (*jumps.without(position.position_ned_m)[:2], contact.rest_down_m)
+    flight.home_ned_m = contact.rest_ned_m or below
     rest = contact.rest_ned_m and jumps.reported(contact.rest_ned_m)
     if flight.service and flight.service.anchor == "here":
         above_m = flight.plan.place_start(
@@ -259,7 +260,7 @@ def _place_reference(flight: FlightState, position: LocalPosition) -> None:
             )
     else:
         from_rest = rest if flight.service else None
-        flight.plan.origin_ned_m = from_rest or jumps.reported(flight.home_ned_m)
+        flight.plan.origin_ned_m = from_rest or jumps.reported(below)
 
 
 def shown_limits(flight: FlightState, learner: Learner) -> dict[str, tuple[float, ...]]:

@@ -96,7 +96,7 @@ class VehicleState:
     @property
     def unmeasured_s(self) -> float:
         """For how long the horizontal innovation ratios have been exactly the same: the estimator
-        uses neither GPS nor an external position. Optical flow does not change them. Infinite if
+        uses neither GPS nor external vision. Optical flow does not change them. Infinite if
         no two reports differed."""
         return self.heard_s.get(EstimatorReport, -math.inf) - self.measured_s
 

@@ -28,6 +28,7 @@ _SENSORS = {
 }
 # ESTIMATOR_STATUS_FLAGS and EKF_STATUS_FLAGS have the same bits
 _EKF_BITS = dict(zip(events.ESTIMATE, (1, 2, 8, 32), strict=True))
+_BY_GPS = 512  # ESTIMATOR_PRED_POS_HORIZ_ABS
 ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 FIX_3D = 3  # GPS_FIX_TYPE; greater numbers are better fixes
 _REAL32 = 9  # MAV_PARAM_TYPE
@@ -133,10 +134,12 @@ def _estimator(message: Any, _: Dialect) -> events.Event:
     names = _RATIOS[message.get_msgId()].items()
     ratios = ((name, getattr(message, field)) for name, field in names)
     accuracy_m = getattr(message, "pos_horiz_accuracy", math.nan)  # not in ArduPilot's message
+    px4 = message.get_msgId() == _PX4_ESTIMATOR
     return events.EstimatorReport(
         valid=frozenset(part for part, bit in _EKF_BITS.items() if message.flags & bit),
         ratios=tuple((name, ratio) for name, ratio in ratios if math.isfinite(ratio)),
         accuracy_m=accuracy_m if math.isfinite(accuracy_m) else None,
+        by_gps=not px4 or bool(message.flags & _BY_GPS),
     )
 
 

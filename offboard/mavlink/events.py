@@ -18,6 +18,7 @@ WARNING, NOTICE = 4, 5  # MAV_SEVERITY; more severe is a lower number
 MODE_KNOWN_S = 2.5
 GOOD_RESULTS = ("ACCEPTED", "IN_PROGRESS")  # MAV_RESULT
 HORIZONTAL = "velocity", "horizontal position"  # measurements of an EstimatorReport
+MOTION = (*HORIZONTAL, "height")
 ESTIMATE = ("attitude", "horizontal velocity", "horizontal position", "height")  # parts needed
 
 
@@ -132,6 +133,7 @@ class EstimatorReport(Event):
     ratios: tuple[tuple[str, float], ...]
     # horizontal standard deviation; None: not reported, or not finite
     accuracy_m: float | None = None
+    by_gps: bool = True  # whether it uses positions of a GPS; only PX4 reports that it does not
 
     @property
     def horizontal_ratios(self) -> list[float]:
@@ -148,10 +150,19 @@ class EstimatorReport(Event):
         missing = [part for part in ESTIMATE if part not in self.valid]
         if missing:
             return f"its estimator has no valid {', '.join(missing)}"
-        name, ratio = self.worst
-        if ratio > 1.0:
-            return f"its estimator rejects {name} (innovation ratio {ratio:.2f}, limit 1)"
-        return ""
+        return self._rejects(*self.worst)
+
+    @property
+    def lost(self) -> str:
+        """What it rejects of MOTION, whose estimate then drifts; may be empty. A heading that a
+        magnet disturbs does not count."""
+        motion = [each for each in self.ratios if each[0] in MOTION]
+        return self._rejects(*max(motion, key=lambda each: each[1], default=("", 0.0)))
+
+    def _rejects(self, name: str, ratio: float) -> str:
+        if ratio <= 1.0:
+            return ""
+        return f"its estimator rejects {name} (innovation ratio {ratio:.2f}, limit 1)"
 
 
 @dataclass(frozen=True, slots=True)

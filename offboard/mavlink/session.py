@@ -31,6 +31,7 @@ COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the sender of frames
 RECORD_COMPONENT_ID = 192
 
 _ECHOES = 256  # our newest frames, which are recognised if a router sends them back
+REPEATS_MIN = 3  # of one TIMESYNC request: a router may duplicate a datagram
 _HEARTBEAT_PERIOD_S = 0.999  # 1 Hz; below 1 s, so that rounding does not delay it by a turn
 
 
@@ -60,8 +61,9 @@ class Reception:
     `frames` are for the log: all frames with a correct checksum, used or not, except those with our
     ids (which in the log mean that we sent a frame) and those that signing refused. `unlogged` are
     frames that another program sent with our ids or those of our records, each as a pair: the
-    number of `frames` before it, and the frame. `replies` answer TIMESYNC requests. They must be
-    sent last: in lockstep, a frame that is sent after the reply acts one barrier later.
+    number of `frames` before it, and the frame. `replies` answer the TIMESYNC requests of a
+    simulator in lockstep. They must be sent last: a frame that is sent after the reply acts one
+    barrier later.
     """
 
     frames: list[bytes] = field(default_factory=list)
@@ -84,6 +86,8 @@ class Session:
         self._sent: deque[bytes] = deque(maxlen=_ECHOES)
         self.telemetry = Telemetry(settings.capacity_bytes_ps)
         self.time = self.telemetry.time
+        self._answers = settings.lockstep  # whether TIMESYNC requests are answered
+        self._requested_ns, self._repeats = -1, 0  # newest request, and how often it was repeated
         self._began_s: float | None = None  # stamp of the first TIMESYNC request
         self._simulated_s = 0.0  # from that request to the newest one
         # `elapsed_s`, `link_time_s` and custom_mode of our newest heartbeat
@@ -146,9 +150,19 @@ class Session:
             self.telemetry.interpret(frame, now_s, found.events)
 
     def _synchronise(self, frame: framing.Frame, now_s: float, found: Reception) -> None:
-        """Add to `found` the reply to a TIMESYNC request (tc1 is 0), or the event of a reply."""
+        """Add to `found` the reply to a TIMESYNC request (tc1 is 0), or the event of a reply.
+
+        Only a simulator in lockstep gets a reply. It repeats its request while it waits. PX4 takes
+        the replies of all programs on a link for one clock, by which it reads the time stamps of
+        external vision: with a second clock it loses its position.
+        """
         tc1_ns, ts1_ns = frame.message.tc1, frame.message.ts1
         if tc1_ns == 0:
+            self._repeats = self._repeats + 1 if ts1_ns == self._requested_ns else 0
+            self._requested_ns = ts1_ns
+            self._answers |= self._repeats >= REPEATS_MIN
+            if not self._answers:
+                return
             self._began_s = ts1_ns * 1e-9 if self._began_s is None else self._began_s
             self._simulated_s = ts1_ns * 1e-9 - self._began_s
             # not 0, because a reply with tc1 = 0 would be a request

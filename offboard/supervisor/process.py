@@ -139,7 +139,6 @@ class TakeOver:
             at_s = clock.monotonic_s() if self._link.is_stream else chunk.arrived_s
             for event in reception.events:
                 self._recovery.see(event, at_s)
-            self._send(*reception.replies)
         self._link.follow(self._session.peer)
         due = self._session.poll(clock.monotonic_s(), (ACTIVE, LANDING))
         self._send(*(message for message in due if isinstance(message, Heartbeat)))

@@ -1,11 +1,11 @@
 """Recovery: what the supervisor requests of a vehicle that has lost its controller. No I/O, no
 clock.
 
-It requests hold, and after some seconds land; if the controller was landing the vehicle, it
-requests land at once. README.md lists in which modes it does so, and which modes are a pilot's
-choice. The autopilot's failsafe for missing setpoints may act, too, because the controller has
-ended. It is recognised by its mode, its time and HEARTBEAT.system_status, which a pilot's choice
-clears.
+It requests hold, and after some seconds land; if the controller was landing the vehicle, or the
+vehicle refuses to hold, it requests land at once. README.md lists in which modes it does so, and
+which modes are a pilot's choice. The autopilot's failsafe for missing setpoints may act, too,
+because the controller has ended. It is recognised by its mode, its time and
+HEARTBEAT.system_status, which a pilot's choice clears.
 """
 
 from __future__ import annotations
@@ -115,8 +115,10 @@ class Recovery:
                 self._sticks = received
             case LocalPosition(velocity_ned_mps=(_, _, down_mps)) if down_mps > SINK_MPS:
                 self._sank_s = at_s
-            case CommandAck(_, result) if result not in GOOD_RESULTS:
+            case CommandAck(command, result) if result not in GOOD_RESULTS:
                 self.news.append(f"the vehicle answers {result}")
+                if command == self._dialect.hold().command:  # PX4 without a global position
+                    self._hold_s = 0.0
             case CommandAck(command) if command == self._dialect.hold().command:
                 self._acknowledged |= at_s > self._first_s
 

@@ -311,7 +311,7 @@ FOUND: list[tuple[Any, ...]] = [
     (beside(GCS_HEARTBEAT, 1, 1, 1.0, place=SAME_PLACE),
      ("senders", WARN, "another program sends with the ids of the vehicle, system 1 component 1"),
      ("loss", OK, "^0.0% of the bytes damaged")),
-    (beside(TIME, 255, 190, 2.0), ("clock", WARN, "another time master: component 255/190")),
+    (beside(TIME, 255, 190, 2.0), ("clock", OK, "time master: component 255/190")),
     # the link
     (link(latency_s=0.3), ("delay", BLOCKS, "the delay of the link is")),
     (link(jitter_s=0.8, direction="up"), ("delay", BLOCKS, "the delay of the link is")),

@@ -195,6 +195,13 @@ def no_fix(flight: FlightState, for_s: float) -> None:
     flight.vehicle.heard_s[GpsFix] = NOW_S - for_s
 
 
+def rejected(name: str) -> Any:
+    """A heading that is rejected, too, does not count."""
+    return lambda flight, ratio: hear(
+        flight, EstimatorReport(frozenset(ESTIMATE), (("heading", 2.0), (name, ratio)))
+    )
+
+
 def sinks(flight: FlightState, sink_mps: float) -> None:
     at(flight, 0.0, -1.0, sink_mps)
     flight.thrusts.append(1.0)
@@ -263,6 +270,8 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("positioning", valid, frozenset(ESTIMATE), frozenset(ESTIMATE[:1])),
     ("positioning", no_fix, 1.0, 2.1),
     ("positioning", repeats, 1.0, 1.1),
+    ("innovations", rejected("horizontal position"), 1.0, 1.1),
+    ("innovations", rejected("height"), 1.0, 1.1),
     ("volume", lambda flight, height_m: at(flight, 0.0, -height_m), 120.0, 120.1),
     ("volume", lambda flight, away_m: at(flight, away_m, -1.0), 1000.0, 1000.1),
     ("battery", lambda flight, left: hear(flight, SystemHealth(True, left)), 0.1, 0.09),
@@ -288,6 +297,15 @@ def test_every_failsafe_row_acts_beyond_its_limit() -> None:
             judge(flight, [replace(BY_NAME[name], held_s=0.0)])
             assert "{" not in flight.failsafe.reason + flight.failsafe.cause
             assert name != "decision" or flight.failsafe.reason == exceeds * "it was late"
+
+
+def test_a_gps_fix_that_the_estimator_does_not_use_may_be_lost() -> None:
+    """A vehicle that flies by external vision, near a window."""
+    for by_gps in (True, False):
+        flight = uneventful()
+        hear(flight, EstimatorReport(frozenset(ESTIMATE), (), 0.5, by_gps=by_gps))
+        no_fix(flight, 2.1)
+        assert bool(BY_NAME["positioning"].condition(flight)) is by_gps
 
 
 def test_begin_with_other_sender_allows_another_program() -> None:

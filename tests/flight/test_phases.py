@@ -31,6 +31,7 @@ from offboard.flight.phases import (
 from offboard.flight.state import FlightState
 from offboard.flight.transitions import next_row, table
 from offboard.identification.uncertainty import Estimate
+from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.events import (
     Attitude,
     CommandAck,
@@ -152,6 +153,13 @@ EVENTS: dict[str, Setup] = {
     "vehicle_found": lambda flight: vars(flight.session).update(vehicle=VehicleFound(1, 1, "px4")),
     "usable": _fit,
     "refused": lambda flight: vars(flight.session).update(refusals=["no multirotor"]),
+    "only_mode_is_unfit": _all(
+        _since(10.1), lambda flight: vars(flight.session).update(only_mode=True)
+    ),
+    "hold_refused": lambda flight: [
+        flight.requested_s.update({PX4.hold(): (NOW_S, NOW_S)}),
+        hear(flight, CommandAck(176, "TEMPORARILY_REJECTED")),
+    ],
     "armed_already": _all(
         partial(heartbeat, armed=True, mode="POSCTL"), _set(limits=Limits(begin_armed=False))
     ),
@@ -224,6 +232,9 @@ def preflight_list(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(preflight, "not_ready", not_ready)
     monkeypatch.setattr(preflight, "refusals", refusals)
+    monkeypatch.setattr(
+        preflight, "only_mode_is_unfit", lambda ground: "only_mode" in vars(ground.session)
+    )
 
 
 def event_of(row: Transition) -> Setup:

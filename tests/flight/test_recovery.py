@@ -88,6 +88,17 @@ def test_recovery_requests_hold_then_land_until_disarmed(
 
 
 @FIRMWARES
+def test_recovery_lands_a_vehicle_that_refuses_to_hold(dialect: Dialect) -> None:
+    """PX4 by motion capture has no global position, which its hold needs."""
+    refused = 0.05, CommandAck(HOLD, "TEMPORARILY_REJECTED")
+    shown = beats(dialect.engage_mode, 0.5, 1.5)
+    commands, _ = asked(dialect, refused, *shown, shown=dialect.engage_mode)
+    assert commands[0] == (0.0, HOLD)
+    assert commands[1:2] == [(pytest.approx(0.52), LAND)]
+    assert HOLD not in words(commands[1:])
+
+
+@FIRMWARES
 def test_recovery_commands_only_a_vehicle_in_our_modes(dialect: Dialect) -> None:
     """A hold mode that the vehicle has not acknowledged, or showed before, was chosen by somebody
     else. A hold that the controller had requested is ours."""

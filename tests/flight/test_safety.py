@@ -6,6 +6,7 @@ These faults were seen on real autopilots; each test flies with the fault of a s
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -44,6 +45,8 @@ from offboard.flight.phases import FLYING, Action, Phase
 from offboard.identification.learner import IdentifySettings
 from offboard.mavlink.senders import HEARD_S
 from simulator import config as simulated
+from simulator.autopilot.firmware import Rule
+from simulator.autopilot.values import Result
 from simulator.config import Start
 from simulator.firmware.px4 import PX4
 
@@ -85,6 +88,14 @@ def too_heavy(pair: Pair) -> None:
 GPS_LOST = {"fault": "gps_loss", "after": "engaged", "at_s": 7.0, "drift_mps": 0.45}
 SILENT_GPS = {"fault": "silent_message", "message": "GPS_RAW_INT", "after": "engaged", "at_s": 7.0}
 OTHER = another_companion(after="engaged", at_s=7.0, setpoint_rate_hz=10, thrust=0.5)
+REFUSES_HOLD = with_rate(PX4, 50.0)
+REFUSES_HOLD = replace(
+    REFUSES_HOLD,
+    rules=(
+        Rule("mode", when=("armed", "requests AUTO.LOITER"), result=Result.TEMPORARILY_REJECTED),
+        *REFUSES_HOLD.rules,
+    ),
+)
 AWAY = "the attitude is [0-9]+ deg away from every recent command"
 NAMED = "; another companion computer, system 1 component 194, may send setpoints, too"
 RARE = "another companion that is not heard, on PX4"
@@ -109,6 +120,10 @@ def soon(since: Phase, within_s: float) -> Check:
         assert begun_s(pair, Phase.LAND) < begun_s(pair, since) + within_s
 
     return check
+
+
+def lands_at_once(pair: Pair) -> None:
+    assert begun_s(pair, Phase.LAND) - begun_s(pair, Phase.HOLD) < 0.2
 
 
 def held_for(name: str) -> Check:
@@ -226,6 +241,11 @@ ROWS = {
         "another program controls the vehicle on this link, too", landed,
         held_for("second sender"), fly=copter.lap, scenario=OTHER, error_m=0.3,
         ended_by="second sender",
+    ),
+    # level setpoints for the 2 s of a hold would let it drift
+    "a vehicle without a global position, which refuses to hold": ends(
+        "another program .*; the vehicle refuses AUTO.LOITER .TEMPORARILY_REJECTED.", landed,
+        lands_at_once, fly=px4.lap, scenario=OTHER, firmware=REFUSES_HOLD,
     ),
     # the other setpoints are not on our link, but the vehicle does not follow ours any more
     "another companion that is not heard": ends(

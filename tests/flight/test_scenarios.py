@@ -46,8 +46,25 @@ from simulator.autopilot.values import Result, Severity, StatusText
 from simulator.firmware.ardupilot import ARDUPILOT
 
 TAKEOFF = 22  # MAV_CMD
+SYS_STATUS, ESTIMATOR_STATUS = 1, 230
 STILL_ARMED = "it has stood still for 15 s and is armed: its land detector reports that it flies"
 CLOCK_SET_BACK = {"fault": "clock_jump", "jump_s": -3, "after": "landing", "at_s": 0.5}
+
+
+def flown_by_external_vision() -> Filter:
+    """Return a filter that makes a PX4 report no use of GPS, and pre-arm checks that pass in
+    OFFBOARD only: AUTO.LOITER needs a global position."""
+    modes = [0]
+
+    def change(message: Any) -> None:
+        if message.get_msgId() == faults.HEARTBEAT:
+            modes[0] = message.custom_mode
+        elif message.get_msgId() == ESTIMATOR_STATUS:
+            message.flags &= ~512
+        elif modes[0] != 6 << 16:
+            message.onboard_control_sensors_health &= ~0x10000000
+
+    return faults.rewritten(change, faults.HEARTBEAT, SYS_STATUS, ESTIMATOR_STATUS)
 
 
 def late_both_ways(pair: Pair) -> None:
@@ -392,6 +409,9 @@ ROWS = {
     "no vehicle": refusal(
         "no vehicle heard in 14 s", says_once_that_nothing_is_heard,
         dead=True, limits={"connect_s": 14.0},
+    ),
+    "PX4 by external vision, whose pre-arm checks pass only in OFFBOARD": flies(
+        whole, down=flown_by_external_vision()
     ),
     "the land detector is not heard": refusal(
         r"not ready: it does not report whether it flies \(EXTENDED_SYS_STATE\)", nothing_sent,

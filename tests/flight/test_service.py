@@ -297,6 +297,18 @@ def test_anchor_origin_needs_a_known_takeoff_point(served: Served) -> None:
     assert said(pair, "not engaged: its take-off point is not known")
 
 
+def test_the_volume_begins_at_the_take_off_point_wherever_the_pilot_engages(served: Served) -> None:
+    """limits.radius_m of a room must not move along with each engagement."""
+    pair = served()
+    pair.fly_up()
+    latitude, longitude, _ = pair.instance.autopilot.firmware.origin
+    pair.ground(REPOSITION, 2, 1, 0, np.nan, latitude + 4e-5, longitude, np.nan)
+    pair.run(8.0)
+    pair.engage()
+    assert pair.state.from_takeoff_m == pytest.approx(pair.place * (1, 1, -1), abs=0.1)
+    assert pair.place[0] > 4.0
+
+
 def test_lost_supervisor_prevents_only_new_flights(served: Served) -> None:
     pair = served.engaged()
     pair.service.current.guard(False)

@@ -134,6 +134,10 @@ def test_estimator_reports_name_their_problem() -> None:
             assert report.worst[1] == pytest.approx(max(r for r in ratios if r == r))
         known_m = None if math.isnan(accuracy_m) else pytest.approx(accuracy_m)
         assert received(px4).accuracy_m == known_m
+    # of PX4 1.16.1 by GPS, by external vision, and after that was lost
+    for flags, by_gps in ((831, True), (0x16F, False), (0x6F, False)):
+        px4 = mavlink.MAVLink_estimator_status_message(10**6, flags, *filled, 0.3, 0.3)
+        assert received(px4).by_gps == by_gps
 
 
 # --- time ---

@@ -224,16 +224,22 @@ def test_acks_for_other_programs_are_ignored() -> None:
 # --- what is sent ---
 
 
-def test_timesync_is_answered_before_the_first_heartbeat() -> None:
-    """Only a vehicle's request is answered, not a ground station's."""
-    vehicle, session = Sender(7), Session(SessionSettings())
-    request = mavlink.MAVLink_timesync_message(0, 123_456_789_012)
-    for now_s in (0.0, 2.5):
-        (answer,) = session.receive(vehicle.frame(request), PEER, now_s).replies
+def test_only_a_simulator_in_lockstep_gets_timesync_replies() -> None:
+    """Also before its first HEARTBEAT, and without the setting once it repeats its request. PX4
+    would take our clock for that of a program that sends it external vision."""
+    vehicle, session = Sender(7), Session(SessionSettings(lockstep=True))
+    live = Session(SessionSettings())
+    for now_ns in (0, 2_500_000_000):
+        request = mavlink.MAVLink_timesync_message(0, 123_456_789_012 + now_ns)
+        (answer,) = session.receive(vehicle.frame(request), PEER, 0.0).replies
         reply = understood(session.encode(answer))
-        assert (reply.tc1, reply.ts1) == (max(round(now_s * 1e9), 1), 123_456_789_012)
-        assert session.receive(Sender(255, 190).frame(request), PEER, now_s).replies == []
-        session.receive(vehicle.heartbeat(), PEER, now_s)
+        assert (reply.tc1, reply.ts1) == (1, 123_456_789_012 + now_ns)
+        assert session.receive(Sender(255, 190).frame(request), PEER, 0.0).replies == []
+        assert live.receive(vehicle.frame(request), PEER, 0.0).replies == []
+        for each in (session, live):
+            each.receive(vehicle.heartbeat(), PEER, 0.0)
+    replies = [live.receive(vehicle.frame(request), PEER, 0.0).replies for _ in range(3)]
+    assert [len(each) for each in replies] == [0, 0, 1]
     theirs = vehicle.frame(mavlink.MAVLink_timesync_message(1, 2))
     reception = session.receive(theirs, PEER, 2.5)
     assert reception.replies == []
