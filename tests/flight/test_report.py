@@ -332,7 +332,7 @@ def test_report_command_overwrites_nothing_and_refuses_non_logs(
     assert invoke(log)[0] == 0
     for content in (b"", b"no log" * 100):
         (tmp_path / "y.tlog").write_bytes(content)
-        assert "is not a .tlog, or empty" in invoke(tmp_path / "y.tlog")[1]
+        assert "is empty or not a .tlog" in invoke(tmp_path / "y.tlog")[1]
     assert "does not exist" in invoke(tmp_path / "nothing")[1]
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "report-2.html", "report.html", "x.tlog", "y.tlog",

@@ -49,8 +49,8 @@ DAMAGE = "x.tlog: 1 damaged entry was skipped, the first at byte 0\n"
 @pytest.mark.parametrize(
     ("content", "command", "code", "says"),
     [
-        (b"", "score", 2, "is not a .tlog, or empty"),
-        (b"PK\3\4" + bytes(500), "score", 2, "is not a .tlog"),
+        (b"", "score", 2, "is empty or not a .tlog"),
+        (b"PK\3\4" + bytes(500), "score", 2, "is empty or not a .tlog"),
         (None, "score", 2, "x.tlog is not a regular file; name a flight directory or a .tlog file"),
         (gigabytes(), "report", 2, "x.tlog: its configuration unpacks to more than 4000 kB\n"),
         (RECORDING.read_bytes()[:-7], "score", 0, ""),

@@ -100,7 +100,7 @@ def test_pool_reports_each_ended_vehicle_and_launches_the_next() -> None:
         pid = pool.process.pid
         for options, says in (
             (["--scenario", "storm"], "there is no scenario named 'storm'; known are"),
-            (["--firmware", "betaflight"], "--firmware betaflight: unknown"),
+            (["--firmware", "betaflight"], "--firmware betaflight is unknown"),
         ):
             pool.launch(options)
             ending = pool.ending(10.0)

@@ -191,7 +191,7 @@ def test_tcp_client_that_never_reads_is_disconnected(server: TcpLink) -> None:
 def test_unusable_links_are_refused_and_instance_ports_shifted(server: TcpLink) -> None:
     with pytest.raises(LinkError, match="cannot be opened"):
         open_link(f"tcpin:127.0.0.1:{server.port}", 0)
-    with pytest.raises(LinkError, match="fault stranger: it needs a UDP link"):
+    with pytest.raises(LinkError, match="fault stranger needs a UDP link"):
         open_beside(server)
     assert shifted("tcpin:127.0.0.1:5760", 2) == "tcpin:127.0.0.1:5780"
     assert shifted("udpin:127.0.0.1:5760", 2) == "udpin:127.0.0.1:5762"
