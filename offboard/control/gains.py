@@ -54,7 +54,7 @@ def _regulator(model: LinearModel, effort: float, period_s: float) -> CostToGo:
 
 
 # Designing a gain takes 5 ms. A take-over and each search for the supported bandwidth need the same
-# few gains again: these are known since the ground, because delays do not change them
+# few gains again. They were computed on the ground, and delays do not change them
 @lru_cache(maxsize=256)
 def _solved(dynamics: bytes, input_map: bytes, effort: float, period_s: float) -> CostToGo:
     inputs = np.frombuffer(input_map)

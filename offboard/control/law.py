@@ -239,8 +239,8 @@ class TrackingLaw:
     def feedforward(self, flat: FlatState, tilt: Any, thrust: Any) -> Array:
         """Return b_c north, b_c east and T b_z (..., 3) that follow the reference. `tilt` and
         `thrust` index the samples of `flat` in the middle of a hold. The response of the vehicle is
-        compensated (`model.axes.lead`), and so is, to second order, the difference between a curved
-        command and its mean over the hold."""
+        compensated (`model.axes.lead`), and for the tilt also, to second order, the attenuation by
+        the hold (README.md)."""
         b, rate = flat.thrust_direction_ned[tilt, :2], flat.thrust_direction_rate_ned_ps[tilt, :2]
         bend = flat.thrust_direction_acceleration_ned_ps2[tilt, :2]
         led_tilt = lead(b, rate, bend, self.vehicle.tilt) - self.period_s**2 / 24.0 * bend

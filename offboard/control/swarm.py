@@ -1,4 +1,5 @@
-"""The particle swarm of Eqs. 19-20 and 30: a search for the minimum of any cost within bounds.
+"""The particle swarm of the paper, Eqs. 19-20 and 30: a search for the minimum of any cost within
+bounds.
 
     swarm = Swarm(settings, lower, upper, rng)
     for _ in range(settings.iterations):

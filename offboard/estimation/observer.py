@@ -223,7 +223,7 @@ class Observer:
         self.reset()
 
     def reset(self) -> None:
-        """Return to the state after construction, for another flight."""
+        """Return to the state after construction, for another flight; keep the vehicle model."""
         self._frozen = False
         self._sent = np.empty((0, COMMAND_SIZE))
         self._state: Array = np.zeros(STATE_SIZE)
@@ -272,7 +272,8 @@ class Observer:
         self._frozen = frozen
 
     def on_command(self, time_s: float, command: Command) -> None:
-        """Store a command that was sent when the newest telemetry had vehicle time `time_s`."""
+        """Store a command that was sent. The delays of the vehicle model count from `time_s`: the
+        vehicle time of the newest telemetry, plus the growth of the link delay since take-off."""
         north, east, _ = command.thrust_direction_ned
         if len(self._sent):
             time_s = max(time_s, float(self._sent[-1, SENT_AT]))

@@ -87,7 +87,7 @@ def act_without_telemetry(flight: FlightState, time_s: float) -> None:
 
 
 def _end(flight: FlightState) -> None:
-    """Ask the autopilot to hold or to land."""
+    """Request hold or land."""
     dialect, authority = _dialect(flight), flight.authority
     holds = flight.phase is not Phase.LAND
     if not holds:
@@ -122,9 +122,10 @@ def _await_link(flight: FlightState) -> None:
 
 
 def _disarm_if_standing(flight: FlightState) -> None:
-    """Ask a vehicle that stands on the ground and stays armed to disarm; never by force, so that
-    the autopilot refuses in the air. If its land detector reports flight, tell the user to disarm
-    it instead. Wait first, because without a lift-off it has stood since before the landing."""
+    """Request disarming if the vehicle stands on the ground and stays armed; never by force, so
+    that the autopilot refuses in the air. If its land detector reports flight, tell the user to
+    disarm it instead. Wait first, because without a lift-off it has stood since before the landing.
+    """
     contact = flight.contact
     if not contact.stands or flight.in_phase_s < min(STANDING_S, 0.5 * flight.limits.land_s):
         return

@@ -5,7 +5,7 @@ another mode that we did not request. This loss is final: a mode that a pilot, a
 failsafe has chosen is never changed. No setpoint or command is sent without a recent report.
 
 The exception is the mode of the autopilot's own failsafe for missing setpoints, which nobody chose:
-from this mode the vehicle may be asked to land, unless it receives a pilot's sticks.
+from this mode land may be requested, unless the vehicle receives a pilot's sticks.
 
 While the vehicle is not ours, `PilotSwitch` says whether the pilot has engaged the service.
 """
@@ -62,7 +62,7 @@ class Authority:
     lost_s: float = math.inf  # time of the loss; -inf if a HEARTBEAT reported it
     setpoint_loss: SetpointLoss = NEVER  # what the autopilot does without setpoints
     arrived_s: float = -math.inf  # host time of the arrival of the newest report
-    _asked_in: str = ""  # the mode reported when we asked for `engage_mode`
+    _asked_in: str = ""  # the mode reported when we requested `engage_mode`
     # modes that we requested to end the flight, oldest first; when the vehicle shows one of them,
     # those requested before it are dropped
     _requested: list[str] = field(default_factory=list)

@@ -215,11 +215,12 @@ def hover_mps2(flight: FlightState) -> float:
 def request(flight: FlightState, request: CommandLong) -> bool:
     """Send a command if the vehicle is ours. Returns whether it was sent.
 
-    Each command is sent once in a phase. It is sent again only if it was refused or not answered
-    for REPEAT_S, and the vehicle has reported its mode since then, because a pilot may have changed
-    it. The link may be late in both directions. Therefore a report counts only if it arrives after
-    the reply to the TIMESYNC request that was sent with the command, or to a later one. Without
-    telemetry for a second, or without such a reply for ANSWERS_S, every later report counts.
+    Each command is sent once in a phase. It is sent again only if it was refused or not answered,
+    REPEAT_S after it was sent, and if the vehicle has reported its mode since then, because a pilot
+    may have changed it. The link may be late in both directions. Therefore a report counts only if
+    it arrives after the reply to the TIMESYNC request that was sent with the command, or to a later
+    one. Without telemetry for a second, or without such a reply for ANSWERS_S, every later report
+    counts.
     """
     result = flight.vehicle.results.get(request.command)
     requested_s, host_s = flight.requested_s.get(request, NEVER)

@@ -52,8 +52,8 @@ class Action(IntEnum):
 
     FLY = 0
     LEVEL = 1  # a level setpoint has replaced the last decision; nothing else is done
-    HOLD = 2  # the autopilot is asked to hold, after `Limits.hold_s` to land
-    LAND = 3  # the autopilot is asked to land
+    HOLD = 2  # hold is requested, after `Limits.hold_s` land
+    LAND = 3  # land is requested
 
 
 class Request(Enum):
@@ -118,8 +118,9 @@ class ServiceOptions:
 
 
 class Limits(Parameters):
-    """Limits of a flight, in SI units. Seconds are vehicle time, except that `connect_s` and
-    `silence_s` are host time (in lockstep simulated time). `failsafe` defines what happens when a
+    """Limits of a flight, in SI units. Seconds are link time (see `state`), but `connect_s` and
+    `silence_s` are host time (in lockstep simulated time), and `blind_s`, ages and delays are
+    vehicle time. `failsafe` defines what happens when a
     limit is exceeded in flight. The class variables are not settings, because no vehicle, link or
     site needed another value."""
 

@@ -27,7 +27,7 @@ MINIMUM_TELEMETRY_HZ = 10.0
 REPEAT_S = 0.5  # between two requests for a parameter
 REPLY_TIMEOUT_S = 2.0  # for parameters
 STARTING_S = 90.0  # vehicle time after boot: ArduCopter uses a GPS 30 s after its first 3D fix
-UNANSWERED_S = 3.0  # without a reply to TIMESYNC requests, which are sent ten times a second
+UNANSWERED_S = 3.0  # without a reply to TIMESYNC requests, which are sent at each tick
 
 
 class Level(IntEnum):
@@ -133,8 +133,8 @@ class Row:
 
 def findings(ground: Ground) -> Iterator[tuple[str, bool, Finding]]:
     """Yield what is wrong, in the order of the list, and then what is wrong with the autopilot's
-    parameters. A problem is the name of the check, whether `fly` refuses it at once, and the
-    finding."""
+    parameters. Each item has the name of the check, whether `fly` refuses the vehicle at once, and
+    the finding."""
     for row in PREFLIGHT:
         found = "" if row.fly_only and ground.service else row.problem(ground)
         if found:

@@ -2,7 +2,7 @@
 the other modules take it as an argument.
 
 `VehicleState`, `Authority`, `GroundContact` and `VehicleClock` hold what was received, with its
-time. `transitions` and `failsafe` hold what follows from it. There are three times: vehicle time
+time. `transitions` and `failsafe` decide what follows from it. There are three times: vehicle time
 (`time_boot_ms`), host time (`Session.elapsed_s`, which in lockstep is simulated time) and link time
 (`Session.link_time_s`, which follows vehicle time, or host time while telemetry is missing).
 """
@@ -96,8 +96,8 @@ class FlightState(Ground):
     failsafe: Failsafe = field(default_factory=Failsafe)
     contact: GroundContact = field(init=False)
     pilot: PilotSwitch = PilotSwitch.FOUND
-    # take-off point, or the ground below a vehicle that was found in the air; the jumps of the
-    # position estimate before that are removed
+    # take-off point, or for a vehicle that was found in the air the place where it last rested (if
+    # unknown, the point below it); a place as in `PositionJumps`, without jumps of the estimate
     home_ned_m: Triple = (0.0, 0.0, 0.0)
     took_off: bool = False  # in this flight; a vehicle that was found in the air did not
     touchdown: Touchdown | None = None  # of the landing

@@ -1,6 +1,6 @@
-"""The phase table: which condition leads from which phases to which phase. The first row whose
-condition holds is taken, and the flight enters its target. `actions` defines what is sent in a
-phase.
+"""The phase table and its application: the first row of the present phase whose condition holds is
+taken, and the flight enters its target. `starting` and `flying` have the rows; `actions` defines
+what is sent in a phase.
 """
 
 from __future__ import annotations
@@ -241,9 +241,10 @@ def _begin_climb(flight: FlightState, source: Phase) -> None:
 
 
 def _place_reference(flight: FlightState, position: LocalPosition) -> None:
-    """Place the reference of a vehicle that was found in the air. `home_ned_m` is set below the
-    vehicle, at the height of its last rest. With the anchor "here" the reference starts where the
-    vehicle stops; with "origin" it is relative to the last rest, or as in `fly` to `home_ned_m`."""
+    """Place the reference of a vehicle that was found in the air. `home_ned_m` becomes the place
+    where it last rested or, if that was not seen, the point below it at the height of the local
+    origin. With the anchor "here" the reference starts where the vehicle stops; with "origin" it is
+    relative to the last rest, and in `fly` to the point below the vehicle."""
     contact, jumps = flight.contact, flight.jumps
     below = (*jumps.without(position.position_ned_m)[:2], contact.rest_down_m)
     flight.home_ned_m = contact.rest_ned_m or below

@@ -68,7 +68,7 @@ class VehicleState:
     mode: str = "unknown"
     other_sender: OtherSender | None = None
     other_companion: OtherCompanion | None = None
-    armed_changed_s: float = -math.inf  # link time; infinite until it was first seen armed
+    armed_changed_s: float = -math.inf  # link time; -inf until it was first seen armed
     resumed_s: float = -math.inf  # vehicle time of the first telemetry after an outage
     measured_s: float = -math.inf  # when an EstimatorReport last showed other horizontal ratios
     now_s: float = 0.0
@@ -102,7 +102,8 @@ class VehicleState:
 
     @property
     def disarmed_s(self) -> float:
-        """Time since the vehicle was reported disarmed; 0 while armed, infinite if it never was."""
+        """Time since the vehicle was first reported disarmed; 0 while it is armed, infinite if it
+        was never seen armed."""
         return 0.0 if self.armed else self.now_s - self.armed_changed_s
 
     def age_s(self, kind: type) -> float:

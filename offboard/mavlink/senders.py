@@ -158,9 +158,9 @@ class Senders:
         return True
 
     def judge(self, frame: Frame, peer: Hashable, now_s: float, events: list[Event]) -> bool:
-        """Whether a frame comes from our vehicle and is no command; before the vehicle is found,
-        also a TIMESYNC frame. Adds to `events` the vehicle when it is found, commands to us, other
-        companion computers, and senders that control the vehicle."""
+        """Whether a frame comes from our vehicle, is no command, and no COMMAND_ACK for others;
+        before the vehicle is found, also a TIMESYNC frame. Adds to `events` the vehicle when it is
+        found, commands to us, other companion computers, and senders that control the vehicle."""
         vehicle, message_id = self.vehicle, frame.message_id
         heard = self.note(frame, now_s)
         system_id = vehicle.system_id if vehicle else self._wanted

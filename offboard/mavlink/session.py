@@ -59,7 +59,8 @@ class Reception:
     """Result of receiving one datagram or one portion of a stream.
 
     `frames` are for the log: all frames with a correct checksum, used or not, except those with our
-    ids (which in the log mean that we sent a frame) and those that signing refused. `unlogged` are
+    ids (which in the log mean that we sent a frame), those that signing refused, and SETUP_SIGNING,
+    which contains the key. `unlogged` are
     frames that another program sent with our ids or those of our records, each as a pair: the
     number of `frames` before it, and the frame. `replies` answer the TIMESYNC requests of a
     simulator in lockstep. They must be sent last: a frame that is sent after the reply acts one
@@ -222,5 +223,6 @@ class Session:
 
     @property
     def link_time_s(self) -> float:
-        """Monotonic seconds that follow vehicle time, or host time while telemetry is missing."""
+        """Link time: monotonic seconds that follow vehicle time, or host time while telemetry is
+        missing."""
         return self.time.seconds

@@ -1,4 +1,5 @@
-"""Vehicle time: checks the time stamps of telemetry, and counts the seconds of the session.
+"""Vehicle time and link time: checks the time stamps of telemetry, and counts seconds that follow
+them.
 
 Vehicle time is `time_boot_ms` in seconds, continued when its 32 bits wrap to zero after 49.7 days.
 Host time is any monotonic clock and an argument. The age of telemetry and the delay of the link are
@@ -35,8 +36,8 @@ class VehicleTime:
     one is late, and one far ahead is wrong. Several of them in a row that continue each other are a
     new epoch of the vehicle's clock: a reboot if it is behind the earlier one.
 
-    `newest_s` is the newest stamp of any message. `seconds` is monotonic and follows vehicle time,
-    or host time while telemetry is missing.
+    `newest_s` is the newest stamp of any message. `seconds` is link time: it is monotonic and
+    follows vehicle time, or host time while telemetry is missing.
     """
 
     def __init__(self) -> None:

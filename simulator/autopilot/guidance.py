@@ -27,7 +27,7 @@ Setpoint = AttitudeSetpoint | MotionSetpoint
 class ActiveBehaviour:
     """Holds position (`guidance.hold`); the base class of the other behaviours.
 
-    A new object is made each time a mode is entered. The defaults are those of automatic flight
+    A new object is made each time the behaviour begins. The defaults are those of automatic flight
     that starts in the air and does not end by itself.
     """
 
@@ -42,7 +42,7 @@ class ActiveBehaviour:
         climbs, with NaN for coordinates that are not specified."""
 
     def leave(self) -> None:
-        """End, because another behaviour begins."""
+        """End, because another behaviour begins, or this one begins again."""
 
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
         """Return the motion demanded in this period of the position loop."""
@@ -157,7 +157,7 @@ class Guidance:
 
     def stream_alive(self, now_s: float) -> bool:
         """Whether setpoints still arrive. They count as lost `stream_reaction_s` after the
-        time-out."""
+        timeout."""
         role = self.parameters.role
         age_s = now_s - self.newest_s - role("stream_reaction_s")
         return age_s <= role("stream_timeout_s")
