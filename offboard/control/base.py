@@ -24,7 +24,7 @@ class Situation:
 
     Attributes:
         time_s: Vehicle time of the tick (`time_boot_ms` of the newest telemetry) plus the increase
-            of the link's delay since take-off, s.
+            of the link delay since take-off, s.
         state: The state predicted for the time at which a command sent now takes effect,
             `state.time_s`.
         reference: The trajectory to follow. Its time axis is vehicle time, its positions are in

@@ -196,8 +196,8 @@ def request_parameters(flight: FlightState) -> None:
 
 
 def _fit_telemetry(flight: FlightState) -> None:
-    """Request less telemetry while the delay of the link is too great to fly, because the link may
-    be saturated."""
+    """Request less telemetry while the link delay is too great to fly, because the link may be
+    saturated."""
     link, limits = flight.clock.delay, flight.limits
     if link is None or flight.host_s - flight.clock.began_s < FIT_EVERY_S:
         return

@@ -124,7 +124,7 @@ class Snapshot:
         self.thrust_direction_ned = command.thrust_direction_ned
         self.heading_rad = command.heading_rad
         self.hover_thrust = state.model.hover_thrust  # of the vehicle model in use, 0 to 1
-        # beyond the least delay of the link
+        # beyond the least delay of the last 5 s
         self.telemetry_age_s = age_s if math.isfinite(age_s) else math.nan
         self.link_delay_s = link.value if link else math.nan  # telemetry and setpoint together
         self.link_delay_sd_s = link.sd if link else math.nan

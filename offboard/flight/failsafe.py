@@ -39,13 +39,13 @@ def another_may_control(flight: FlightState) -> str:
 
 
 def telemetry_old(flight: FlightState) -> str:
-    """Age of the newest telemetry beyond the least delay of the link."""
+    """Age of the newest telemetry beyond the least delay of the last 5 s."""
     age_s = flight.age_s
     return f"telemetry is {age_s:.2f} s old" if age_s > flight.limits.setpoint_age_s else ""
 
 
 def late_link(flight: FlightState) -> str:
-    """Growth of the link's delay since take-off (TIMESYNC), or the age of telemetry."""
+    """Growth of the link delay since take-off (TIMESYNC), or the age of telemetry."""
     growth_s = flight.clock.delay_growth_s
     if growth_s > flight.limits.link_growth_s:
         return f"the delay of the link has grown by {growth_s:.2f} s"

@@ -170,7 +170,7 @@ class Flight(FlightState):
         return True
 
     def _follow_link(self) -> None:
-        """Measure the growth of the link's delay, for the prediction and the bandwidth."""
+        """Measure the growth of the link delay, for the prediction and the bandwidth."""
         growth, growth_s = self.clock.growth, max(self.clock.delay_growth_s, self.age_s)
         changed = self.phase in FLYING and growth.step(self.time_s, growth_s)
         if changed and self.identification:

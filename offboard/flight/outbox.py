@@ -64,7 +64,7 @@ def admit(
         ours: whether the vehicle is ours to command (`Authority.permits_setpoint`).
         on_ground: whether it certainly stands on the ground (`GroundContact.on_ground`).
         age_s: age of the telemetry that the setpoint was computed from, beyond the least delay of
-            the link; 0 for a setpoint that needs none.
+            the last 5 s; 0 for a setpoint that needs none.
         age_limit_s: the greatest age of telemetry that is allowed.
         late_s: time by which the setpoint is ready later than one control period after the arrival
             of its telemetry; not positive if it is ready in time.

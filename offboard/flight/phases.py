@@ -149,7 +149,7 @@ class Limits(Parameters):
     land_s: float = Field(default=90.0, gt=0, le=600)
     silence_s: float = Field(default=1.0, ge=0.2, le=60)  # no telemetry
     setpoint_age_s: float = Field(default=0.25, ge=0.1, le=2)  # of telemetry beyond link delay
-    link_growth_s: float = Field(default=0.3, gt=0, le=2)  # of the link's delay since take-off
+    link_growth_s: float = Field(default=0.3, gt=0, le=2)  # of the link delay since take-off
     missed_decisions: int = Field(default=3, ge=1, le=100)  # in a row
     position_error_m: float = Field(default=5.0, ge=0.1, le=100)
     gps_s: float = Field(default=1.0, ge=0.5, le=600)  # without the GPS fix or vision it had

@@ -312,16 +312,16 @@ class FlightState(Ground):
 
     def delays_begin_s(self, time_s: float) -> float:
         """Return the vehicle time from which the delays of the vehicle model count for a command of
-        the tick `time_s`. It is later than `time_s` by the growth of the link's delay since
-        take-off."""
+        the tick `time_s`. It is later than `time_s` by the growth of the link delay since take-off.
+        """
         return time_s + self.clock.growth.added_s
 
     @property
     def age_s(self) -> float:
-        """Age of the newest telemetry at the present turn, beyond the least delay of the link; 0
-        before the first."""
+        """Age of the newest telemetry at the present turn, beyond the least delay of the last 5 s;
+        0 before the first."""
         return self.telemetry_age_s(self.host_s) if self.vehicle.has_state else 0.0
 
     def telemetry_age_s(self, host_s: float) -> float:
-        """Age of the newest telemetry at `host_s`, beyond the least delay of the link."""
+        """Age of the newest telemetry at `host_s`, beyond the least delay of the last 5 s."""
         return self.clock.age_s(self.time_s, host_s)

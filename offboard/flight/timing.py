@@ -1,12 +1,12 @@
-"""Times: the vehicle's clock, the age of telemetry and the delay of the link; and whether this
-computer keeps up with the control ticks.
+"""Times: the vehicle's clock, the age of telemetry and the link delay; and whether this computer
+keeps up with the control ticks.
 
 The vehicle's clock is modelled as a line over host time, with an offset and a rate. It has two
 bounds (README.md): telemetry arrives after the time of its stamp, and a TIMESYNC request arrives
 after it was sent. The request holds the stamp of the newest telemetry and is sent with a setpoint;
 the reply holds this stamp and the vehicle time at which the request arrived. Their difference is
-the delay of telemetry and setpoint together. It depends neither on the clock of this computer nor
-on the delay of the reply.
+the link delay: that of telemetry and setpoint together. It depends neither on the clock of this
+computer nor on the delay of the reply.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ JUMP_S = 0.5  # a stamp that is further ahead of the vehicle time shows a jump o
 
 
 class VehicleClock:
-    """The vehicle's clock and the delay of the link; see the module. Stamps are vehicle time, and
+    """The vehicle's clock and the link delay; see the module. Stamps are vehicle time, and
     `host_s` and `arrived_s` are host time.
 
     `jumped_s` is by how much the clock has jumped forward since `settle`; `growth` is the growth of
-    the link's delay since then. `answered_s` is the host time at which the newest request that has
+    the link delay since then. `answered_s` is the host time at which the newest request that has
     a reply was sent.
     """
 
@@ -136,7 +136,7 @@ class VehicleClock:
         return shown_s if bound_s is None else min(shown_s, bound_s - self._least_s)
 
     def age_s(self, stamp_s: float, host_s: float) -> float:
-        """Age at `host_s` of telemetry stamped `stamp_s`, beyond the least delay of the window."""
+        """Age at `host_s` of telemetry stamped `stamp_s`, beyond the least delay of the last 5 s."""
         return max(self.now_s(host_s) - stamp_s, 0.0)
 
     @property
@@ -198,7 +198,7 @@ class VehicleClock:
 
 
 class LinkGrowth:
-    """Growth of the link's delay since take-off, for the prediction and the bandwidth.
+    """Growth of the link delay since take-off, for the prediction and the bandwidth.
 
     `added_s` is the growth; it follows changes of more than LEAST_GROWTH_S. `changed_s` is the
     range of `added_s` in the last STEADY_S: a delay that changes is not known better than that.

@@ -231,7 +231,7 @@ class Learner(VehicleEstimate):
         """Return the constants to fly with from the next tick on. If nothing is new, do one piece
         of work and return None. `hover_thrust` is the observer's estimate.
 
-        While the link's delay changes with each tick, every other call does a piece of work.
+        While the link delay changes with each tick, every other call does a piece of work.
         """
         told = VehicleUpdate(self.vehicle, self.uncertainty, self.cause)
         if not self._has_told and (self.sentences or self.record or told != self._told):

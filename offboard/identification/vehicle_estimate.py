@@ -42,7 +42,7 @@ MOST_CONTRADICTIONS, CALM_S = 2, 20.0
 # unexplained, is less than this share of the old one's
 BETTER = 0.7
 VAGUE = 2.0  # uncertainty of an sd, as a factor
-LINK_CHANGE_S = 0.1  # a larger change of the link's delay explains a tilt that is not as predicted
+LINK_CHANGE_S = 0.1  # a larger change of the link delay explains a tilt that is not as predicted
 LEAST_JUMP_S, JUMP_SDS = 0.015, 4.0  # delays that differ by more contradict each other
 FACTOR = 4.0  # greatest ratio, either way, of an identified constant to the vehicle file's
 DECISIVE = ("tilt", "hover_thrust")  # if one of these is out of bounds, the flight ends
@@ -52,7 +52,7 @@ LINKED = ("yaw", "thrust_delay_s")  # changed with the tilt's delay if not ident
 @dataclass(frozen=True, slots=True)
 class IdentifiedVehicle:
     """The constants identified by a flight, for the next flight of the same vehicle. The delays of
-    `vehicle` contain the link's delay in that flight, `link_s` (telemetry and setpoint together; 0
+    `vehicle` contain the link delay in that flight, `link_s` (telemetry and setpoint together; 0
     if it was not measured). `delay_sd_s` is the standard deviation of the tilt's delay,
     `thrust_sd_s` that of the thrust's delay plus lag, infinite if no fit was adopted."""
 
@@ -90,8 +90,8 @@ class VehicleEstimate:
         # delay, the thrust's delay plus lag, and the drag (that of its most certain fit)
         self._delay_sd_s, self._thrust_sd_s = known.delay_sd_s, known.thrust_sd_s
         self._drag_sd_ps = math.inf
-        self._link_s = known.link_s  # delay of the link that `vehicle` contains
-        self._link = (0.0, 0.0)  # increase of the link's delay since take-off, and recent change
+        self._link_s = known.link_s  # link delay that `vehicle` contains
+        self._link = (0.0, 0.0)  # increase of the link delay since take-off, and recent change
         self._doubt_s = 0.0  # uncertainty of the delay because telemetry contradicts it
         self._contradictions = 0
         self._calm_from_s = -math.inf  # the time of the last contradiction
@@ -129,7 +129,7 @@ class VehicleEstimate:
 
     @property
     def link_changed(self) -> bool:
-        """Whether the link's delay has just changed: times of earlier commands are then wrong."""
+        """Whether the link delay has just changed: times of earlier commands are then wrong."""
         return self._link[1] > LINK_CHANGE_S
 
     @property
@@ -153,8 +153,8 @@ class VehicleEstimate:
     # ------------------------------------------------------------------ link and take-over
 
     def on_link_delay(self, link: Estimate | None) -> None:
-        """Add the link's delay, measured before lift-off, or its change since an earlier flight, to
-        every delay of the vehicle. The vehicle's own delay and the scatter of the link's delay
+        """Add the link delay, measured before lift-off, or its change since an earlier flight, to
+        every delay of the vehicle. The vehicle's own delay and the scatter of the link delay
         remain unknown. `link` is None if the vehicle did not answer."""
         if link is None:
             return
@@ -169,7 +169,7 @@ class VehicleEstimate:
         self._unknown_s += JUMP_SDS * link.sd
 
     def _on_other_link(self, link: Estimate) -> None:
-        """Change delays identified in an earlier flight by the change of the link's delay."""
+        """Change delays identified in an earlier flight by the change of the link delay."""
         link_s = max(self._link_s, DIRECT_LINK_S)
         changed_s = link.value - link_s
         changed_s = max(changed_s, -self.vehicle.tilt.delay_s, -self.vehicle.yaw.delay_s)
@@ -183,7 +183,7 @@ class VehicleEstimate:
         )
 
     def on_link_growth(self, added_s: float, changed_s: float) -> None:
-        """Use the growth `added_s` of the link's delay since take-off, which the times of commands
+        """Use the growth `added_s` of the link delay since take-off, which the times of commands
         contain, and its recent change `changed_s`, by which the delay is uncertain at least."""
         link = round(added_s, LINK_DIGITS), round(changed_s, LINK_DIGITS)
         if self._link == link:

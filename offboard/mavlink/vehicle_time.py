@@ -2,8 +2,8 @@
 them.
 
 Vehicle time is `time_boot_ms` in seconds, continued when its 32 bits wrap to zero after 49.7 days.
-Host time is any monotonic clock and an argument. The age of telemetry and the delay of the link are
-in `flight.timing`.
+Host time is any monotonic clock and an argument. The age of telemetry and the link delay are in
+`flight.timing`.
 """
 
 from __future__ import annotations
