@@ -61,7 +61,7 @@ def admit(
     """Return the setpoint that may be sent: `command` within the limits of `vehicle`.
 
     Args:
-        ours: whether the vehicle is ours to command (`Authority.permits_setpoint`).
+        ours: whether a setpoint may be sent to the vehicle (`Authority.permits_setpoint`).
         on_ground: whether it certainly stands on the ground (`GroundContact.on_ground`).
         age_s: age of the telemetry that the setpoint was computed from, beyond the least delay of
             the last 5 s; 0 for a setpoint that needs none.
@@ -213,7 +213,7 @@ def hover_mps2(flight: FlightState) -> float:
 
 
 def request(flight: FlightState, request: CommandLong) -> bool:
-    """Send a command if the vehicle is ours. Returns whether it was sent.
+    """Send a command if `Authority.permits_command`. Returns whether it was sent.
 
     Each command is sent once in a phase. It is sent again only if it was refused or not answered,
     REPEAT_S after it was sent, and if the vehicle has reported its mode since then, because a pilot

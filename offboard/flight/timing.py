@@ -136,7 +136,7 @@ class VehicleClock:
         return shown_s if bound_s is None else min(shown_s, bound_s - self._least_s)
 
     def age_s(self, stamp_s: float, host_s: float) -> float:
-        """Age at `host_s` of telemetry stamped `stamp_s`, beyond the least delay of the last 5 s."""
+        """Age at `host_s` of telemetry with this stamp, beyond the least delay of the last 5 s."""
         return max(self.now_s(host_s) - stamp_s, 0.0)
 
     @property
