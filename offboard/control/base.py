@@ -32,8 +32,8 @@ class Situation:
         previous: The last attitude command sent, which is still in force.
         remaining_s: Returns how many seconds of the time budget of this decision are left,
             negative once it is exceeded. None in lockstep, where the vehicle waits.
-        origin_ned_m: The take-off point. References and keep-out volumes are configured relative
-            to it.
+        origin_ned_m: The point to which configured references and keep-out volumes are relative:
+            the take-off point, unless a service placed the reference where the vehicle stopped.
         track_time_s: Time since the start of the configured reference, s; NaN during the climb.
     """
 
