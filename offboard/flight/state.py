@@ -119,7 +119,9 @@ class FlightState(Ground):
     busyness: Busyness = field(init=False)  # of this computer
     heard_s: float = math.nan  # host time of the turn in which the newest telemetry arrived
     telemetry_arrived_s: float = 0.0  # monotonic host time of that arrival, in lockstep too
-    reported_s: float = -math.inf  # `clock.answered_s` when the newest mode was reported
+    # `clock.answered_s` at the newest report of the mode: the vehicle had received what was sent
+    # until then when it sent this report
+    reported_s: float = -math.inf
     bridged_s: float = 0.0  # `silence_s` at the newest setpoint that was sent without telemetry
     ignored: int = 0  # datagrams of others and forged frames between the two newest ticks
     command: Command = field(default_factory=lambda: Command(0.0, LEVEL_DIRECTION, 0.0))  # in force

@@ -1,8 +1,9 @@
 """Telemetry: converts frames of the vehicle to events, in order, and requests the needed rates.
 
 Messages that are late, repeated or implausible are dropped. A ground station may change the rates
-that we requested: therefore rates are measured, and requested again. They are per second of
-`Session.link_time_s`, so that they mean the same in real time, at higher speed and in lockstep.
+that we requested: therefore rates are measured, and requested again. Rates are per second of link
+time (`Session.link_time_s`), so that they mean the same in real time, at higher speed and in
+lockstep.
 """
 
 from __future__ import annotations

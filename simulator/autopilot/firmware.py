@@ -74,7 +74,8 @@ class Rule:
             event X caused, "reached X" after boot event X, "latched X" after event X until a
             reboot, "requests X" if mode X is requested.
         to: name of the next mode; "*": no change; "requested": the mode that the command names;
-            "remembered": the mode chosen last; `ByParameter`: the row fits only its values.
+            "remembered": the last chosen mode with `Mode.remembered`; `ByParameter`: the row fits
+            only its values.
         do: actions (`simulator.autopilot.commander.ACTIONS`).
         result: acknowledgement of a command.
         texts: STATUSTEXTs, in which {name} is one of `simulator.autopilot.commander.TEXT_VALUES`.
@@ -119,7 +120,8 @@ class Firmware(ABC):
     # height of MAV_CMD_NAV_TAKEOFF is above home; MAV_CMD_MISSION_START must not name an item.
     # False: the height of MAV_CMD_NAV_TAKEOFF is above mean sea level
     strict_places: bool = False
-    # of MAV_CMD_DO_CHANGE_SPEED without a speed, MAV_CMD_GET_MESSAGE_INTERVAL of an unknown message
+    # result of MAV_CMD_DO_CHANGE_SPEED without a speed, and of MAV_CMD_GET_MESSAGE_INTERVAL of an
+    # unknown message
     empty_refusal: Result
     vertical_speeds: tuple[float, ...] = ()  # SPEED_TYPEs of climb and descent; others: horizontal
     no_interval_us: int = -1  # MESSAGE_INTERVAL.interval_us of a message that is not streamed
@@ -132,7 +134,8 @@ class Firmware(ABC):
     setpoint_mode_needs_stream: bool = False  # without a stream, its pre-arm checks fail
     setpoints_as_automatic: bool = False  # speed and turn rate limits are those of automatic flight
     setpoints_outlive_modes: bool = False  # taken in any mode, and kept when the mode changes
-    setpoints_imply_flight: bool = False  # attitude setpoints: thrust is flight; no land detector
+    # with attitude setpoints any thrust counts as flight, and no landing is detected
+    setpoints_imply_flight: bool = False
 
     # missions
     requests_kind_of_peer: bool = False  # requests items with or without _INT, as the peer last did

@@ -18,7 +18,7 @@ from simulator.steps import LOOP_S
 from simulator.vehicle.attitude import Demand
 
 _TILT_COSINE_MIN = 0.1  # limit of the tilt compensation: at most ten times the thrust
-_HIGHER_M = 0.01  # a demanded place is above the vehicle; less is noise of the estimate
+_HIGHER_M = 0.01  # a demanded place is above the vehicle if it is higher by this; less is noise
 OFF = Demand()
 
 

@@ -165,7 +165,7 @@ class PositionLoop:
     def _integrate(
         self, setpoint: Triple, velocity: Triple, thrust: float, thrust_least: float
     ) -> None:
-        """Integrate the velocity errors, but the vertical one not if that saturates the thrust
+        """Integrate the velocity errors, but not the vertical one if that would saturate the thrust
         further."""
         for i in range(3):
             error = setpoint[i] - velocity[i]
