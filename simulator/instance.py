@@ -35,7 +35,7 @@ BARRIER_STEPS = 5  # 20 ms
 RESTART_S = 1.0  # silence of the vehicle during a reboot by command
 _TIMESYNC = 111
 # A start in the air
-_CLIMB_S = 120.0  # time-out: 100 m at 1.5 m/s, and then until estimate and truth agree
+_CLIMB_S = 120.0  # timeout: 100 m at 1.5 m/s, and then until estimate and truth agree
 _SETTLE_S = 2.0  # from the boot event "ready" until the vehicle is armed
 _REACHED_M, _STILL_MPS = 0.3, 0.1  # it hovers: true height error, estimated vertical speed
 

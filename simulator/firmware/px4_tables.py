@@ -214,8 +214,8 @@ ROLES: dict[str, Role] = {
     "still_radps": math.radians(20.0),  # LNDMC_ROT_MAX
     "stick_descent_mps": 0.6,  # in a manual mode without stick input
     "setpoint_spool_s": 0.0,  # from arming until the thrust of an attitude setpoint is applied
-    "stream_reaction_s": 0.036,  # from the time-out of the setpoints until they count as lost
-    # time for which a ground station counts as connected after a HEARTBEAT; the time-out follows
+    "stream_reaction_s": 0.036,  # from the timeout of the setpoints until they count as lost
+    # time for which a ground station counts as connected after a HEARTBEAT; the timeout follows
     "ground_station_stays_s": 2.5,
 }
 
