@@ -209,7 +209,7 @@ def clock(seen: Observation) -> Iterable[Finding]:
     if seen.clock.jumped_s:
         yield blocks(f"the vehicle's clock jumped by {seen.clock.jumped_s:.1f} s")
     masters = [s.name for s in seen.senders.found if s.times and s.system_id != system_id]
-    if seen.foreign_replies > FOREIGN_TIMES:
+    if not masters and seen.foreign_replies > FOREIGN_TIMES:
         masters.append(f"the sender of {seen.foreign_replies} requests that are answered here")
     if len(masters) > 1:  # we do not answer the vehicle's requests, and one may
         hint = "let one program alone answer the vehicle's TIMESYNC: that which sends it vision"

@@ -38,6 +38,9 @@ Array = NDArray[np.float64]
 
 KNOWN_S = 2.5  # greatest age of a report that counts when the flight begins
 SILENT_S, SILENT_MESSAGES = 2.0, 10.0  # time and messages missing: more than a lossy link loses
+# An estimator is judged by repeated ratios once it has shown so many different ones in flight.
+# Measurements may be SLOWEST_S apart, and the report of one may come MARGIN_S later
+MEASUREMENTS_MIN, SLOWEST_S, MARGIN_S = 3, 1.0, 0.5
 WORSE = 2.0  # an accuracy that is worse than at the beginning by up to this factor is no loss
 
 
@@ -48,19 +51,18 @@ class Positioning:
 
     had_fix: bool = False  # which the estimator uses
     report: EstimatorReport | None = None
-    measured: bool = False  # whether the estimator used GPS or external vision
+    measurements: int = 0  # `VehicleState.measurements` at the beginning
     fixes_silent_s: float = math.inf  # GPS_RAW_INT is missing after this time without a fix
     reports_silent_s: float = math.inf  # the same for EstimatorReport
 
     def begin(self, vehicle: VehicleState, rates_hz: Mapping[str, float], estimator: str) -> None:
         """Note what there is when the flight begins. `rates_hz` are the rates of the messages that
         arrive, by name; `estimator` is the name of the one that becomes an EstimatorReport."""
-        self.had_fix = vehicle.age_s(GpsFix) < KNOWN_S
+        self.had_fix = vehicle.age_s(GpsFix) < KNOWN_S and not vehicle.without_gps
+        self.measurements = vehicle.measurements
         self.fixes_silent_s = _silent_s(rates_hz.get("GPS_RAW_INT", 0.0))
         if vehicle.age_s(EstimatorReport) < KNOWN_S:
             self.report = vehicle.estimator
-            self.measured = vehicle.unmeasured_s < KNOWN_S
-            self.had_fix &= self.report is None or self.report.by_gps
             self.reports_silent_s = _silent_s(rates_hz.get(estimator, 0.0))
 
     def lost(self, vehicle: VehicleState, limits: Limits) -> str:
@@ -80,9 +82,10 @@ class Positioning:
                 return "its estimator reports no accuracy of the position any more"
             if now.accuracy_m > max(limits.accuracy_m, WORSE * before.accuracy_m):
                 return f"its estimated position is only accurate to {now.accuracy_m:.1f} m"
-        if self.measured and vehicle.unmeasured_s > limits.gps_s:
-            for_s = vehicle.unmeasured_s
-            return f"its estimator has used neither GPS nor external vision for {for_s:.1f} s"
+        measures = vehicle.measurements - self.measurements >= MEASUREMENTS_MIN
+        unmeasured_s = vehicle.unmeasured_s
+        if measures and unmeasured_s > max(limits.gps_s, SLOWEST_S) + MARGIN_S:
+            return f"its estimator has used no GPS or external vision for {unmeasured_s:.1f} s"
         if vehicle.age_s(EstimatorReport) > self.reports_silent_s:
             return "no report of its estimator"
         return ""

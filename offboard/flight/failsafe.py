@@ -26,7 +26,7 @@ FULL_THRUST = 0.99  # normalised
 LOW_THRUST = 0.5
 STANDS_BELOW_M = 0.25  # below the reference, which is at least 0.3 m above the take-off point
 THRUST_REPORT_S = 1.0  # greatest age of a ThrustReport that counts
-ESTIMATOR_REPORT_S = 1.0  # the same for an EstimatorReport
+ESTIMATOR_REPORT_S = 0.7  # the same for an EstimatorReport; one alone must not hold for a second
 
 
 # ---------------------------------------------------------------------- conditions of the failsafe
@@ -141,20 +141,19 @@ def positioning_lost(flight: FlightState) -> str:
 
 
 def measurements_rejected(flight: FlightState) -> str:
-    """Innovation ratio of position, velocity or height, in a report of the last second."""
-    report = flight.vehicle.estimator
-    if report is None or flight.vehicle.age_s(EstimatorReport) > ESTIMATOR_REPORT_S:
+    """Innovation ratio of position, velocity or height, of an estimator without GPS.
+
+    Autopilots fly through a glitch of GPS; in a room there is no space for that."""
+    vehicle = flight.vehicle
+    recent = vehicle.age_s(EstimatorReport) < ESTIMATOR_REPORT_S
+    if vehicle.estimator is None or not (recent and vehicle.without_gps):
         return ""
-    return report.lost
+    return vehicle.estimator.rejects_motion
 
 
 def outside_volume(flight: FlightState) -> str:
     """Height above the take-off point, and horizontal distance from it."""
-    north_m, east_m, height_m = flight.from_takeoff_m
-    distance_m = math.hypot(north_m, east_m)
-    if not (height_m > flight.limits.ceiling_m or distance_m > flight.limits.radius_m):
-        return ""
-    return f"{height_m:.0f} m above and {distance_m:.0f} m from the take-off point"
+    return flight.outside_volume if flight.plan.reference else ""
 
 
 def battery_empty(flight: FlightState) -> str:

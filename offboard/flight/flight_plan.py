@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 # limits of the reference while it returns after a jump of the estimate
 RETURN = Limits(speed_mps=0.5, acceleration_mps2=0.5, cruise_mps=0.5, cruise_vertical_mps=0.5)
 CLEAR_M = 0.5  # least height above the ground of a track that is placed in the air
-SINKS_MPS = 0.3  # a vehicle that sinks faster does not hover
+SINKS_MPS = 0.2  # a vehicle that sinks faster does not hover (PX4 lands at MPC_LAND_CRWL, 0.3)
 SAMPLED_S = 0.1  # interval at which the height of the track is sampled
 
 

@@ -115,6 +115,11 @@ class Ground:
         """Whether the reference is relative to a take-off point that is not known."""
         return False
 
+    @property
+    def outside_volume(self) -> str:
+        """Where the vehicle is, if that is beyond the limits of height or distance; else empty."""
+        return ""
+
 
 @dataclass(frozen=True, slots=True)
 class Row:
@@ -322,8 +327,9 @@ def _remedy(ground: Ground) -> str:
 
 
 def _without_gps(ground: Ground) -> bool:
-    report = ground.vehicle.estimator
-    return report is not None and not report.by_gps and not report.problem
+    """Whether a PX4 has a valid estimate without GPS."""
+    px4 = ground.dialect is not None and not ground.dialect.takes_off_by_command
+    return px4 and ground.vehicle.without_gps and not _no_estimate(ground)
 
 
 def _prearm_fix(ground: Ground) -> str:
@@ -348,6 +354,12 @@ def _estimate_level(ground: Ground) -> Level:
     starts = not fixed or vehicle.time_s < STARTING_S
     rejects = vehicle.estimator is not None and vehicle.estimator.worst[1] > 1.0
     return WAIT if starts and not rejects else BLOCKS
+
+
+def _outside_volume(ground: Ground) -> str:
+    limits = ground.limits
+    named = f" (limits.ceiling_m is {limits.ceiling_m:g}, limits.radius_m is {limits.radius_m:g})"
+    return ground.outside_volume and ground.outside_volume + named
 
 
 def _empty_battery(ground: Ground) -> str:
@@ -420,6 +432,7 @@ PREFLIGHT = (
     Row("prearm", WAIT, _prearm, _prearm_fix, fly_only=True),
     Row("prearm", WARN, _needs_setpoints, _other_mode, fly_only=True),
     Row("battery", BLOCKS, _empty_battery, "charge the battery"),
+    Row("volume", BLOCKS, _outside_volume, "fly nearer to it, or raise the limits"),
     Row("delay", WAIT, _measuring),
     Row("delay", BLOCKS, _late, "use a faster link"),
 )

@@ -198,6 +198,14 @@ class FlightState(Ground):
         return unseen and self.service is not None and self.service.anchor == "origin"
 
     @property
+    def outside_volume(self) -> str:
+        north_m, east_m, height_m = self.from_takeoff_m
+        distance_m = math.hypot(north_m, east_m)
+        if not (height_m > self.limits.ceiling_m or distance_m > self.limits.radius_m):
+            return ""
+        return f"{height_m:.0f} m above and {distance_m:.0f} m from the take-off point"
+
+    @property
     def in_phase_s(self) -> float:
         """Seconds since the phase began."""
         return self.now_s - self.began_s
@@ -223,13 +231,14 @@ class FlightState(Ground):
 
     @property
     def from_takeoff_m(self) -> Triple:
-        """North, east and height of the newest position relative to the take-off point; 0 without
-        a reference."""
+        """North, east and height of the newest position relative to the take-off point; without a
+        reference relative to the last rest, 0 if that was not seen."""
         position = self.vehicle.position
-        if position is None or self.plan.reference is None:
+        home_ned_m = self.home_ned_m if self.plan.reference else self.contact.rest_ned_m
+        if position is None or home_ned_m is None:
             return 0.0, 0.0, 0.0
         place_ned_m = self.jumps.without(position.position_ned_m)
-        north, east, down = map(operator.sub, place_ned_m, self.home_ned_m)
+        north, east, down = map(operator.sub, place_ned_m, home_ned_m)
         return north, east, -down
 
     @property

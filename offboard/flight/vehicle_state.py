@@ -22,6 +22,7 @@ from offboard.mavlink.events import (
     EstimatorReport,
     Event,
     FirmwareVersion,
+    GpsFix,
     Heartbeat,
     Landed,
     LocalPosition,
@@ -70,7 +71,9 @@ class VehicleState:
     other_companion: OtherCompanion | None = None
     armed_changed_s: float = -math.inf  # link time; -inf until it was first seen armed
     resumed_s: float = -math.inf  # vehicle time of the first telemetry after an outage
-    measured_s: float = -math.inf  # when an EstimatorReport last showed other horizontal ratios
+    # when an EstimatorReport last showed other horizontal ratios, and how often one did
+    measured_s: float = -math.inf
+    measurements: int = 0
     now_s: float = 0.0
     heard_s: dict[type, float] = field(default_factory=dict)  # link time, by type of event
     # components of position and velocity, each with the stamp since which it has not changed
@@ -99,6 +102,12 @@ class VehicleState:
         uses neither GPS nor external vision. Optical flow does not change them. Infinite if
         no two reports differed."""
         return self.heard_s.get(EstimatorReport, -math.inf) - self.measured_s
+
+    @property
+    def without_gps(self) -> bool:
+        """Whether the estimator works without GPS: PX4 reports it, or no fix was ever heard."""
+        report = self.estimator
+        return report is not None and not (report.by_gps and GpsFix in self.heard_s)
 
     @property
     def disarmed_s(self) -> float:
@@ -201,7 +210,7 @@ class VehicleState:
                 self.health = event
             case EstimatorReport():
                 if self.estimator and event.horizontal_ratios != self.estimator.horizontal_ratios:
-                    self.measured_s = now_s
+                    self.measured_s, self.measurements = now_s, self.measurements + 1
                 self.estimator = event
             case Landed(state):
                 self.landed = state

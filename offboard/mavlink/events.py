@@ -153,7 +153,7 @@ class EstimatorReport(Event):
         return self._rejects(*self.worst)
 
     @property
-    def lost(self) -> str:
+    def rejects_motion(self) -> str:
         """What it rejects of MOTION, whose estimate then drifts; may be empty. A heading that a
         magnet disturbs does not count."""
         motion = [each for each in self.ratios if each[0] in MOTION]

@@ -121,6 +121,11 @@ class Health:
         """Time since the last GPS fix."""
         return now_s - self._fix_s
 
+    def position_ratio(self, mean: float) -> float:
+        """Innovation test ratio of the horizontal position: it changes with each GPS measurement,
+        and repeats without a fix."""
+        return mean * (1.0 + 0.1 * math.sin(self._fix_s)) if math.isfinite(self._fix_s) else mean
+
     def passes(self, mode: Mode, now_s: float, *, latched: bool, armed: bool) -> bool:
         """Whether the pre-arm checks pass in this mode. `latched`: whether there is a failure that
         only a reboot clears."""

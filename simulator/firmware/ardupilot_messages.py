@@ -79,7 +79,8 @@ def ekf_status_report(view: View) -> Sequence[Any]:
         reached -= {"position"}
     flags = next((bits for event, bits in _EKF_FLAGS if event in reached), _EKF_UNINITIALISED)
     velocity_ratio = max(0.02, view.autopilot.commander.velocity_ratio)
-    return (flags, velocity_ratio, 0.02, 0.02, 0.01, 0.0, 0.0)
+    position_ratio = view.autopilot.health.position_ratio(0.02)
+    return (flags, velocity_ratio, position_ratio, 0.02, 0.01, 0.0, 0.0)
 
 
 def rc_channels(view: View) -> Sequence[Any]:

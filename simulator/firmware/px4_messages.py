@@ -187,8 +187,10 @@ def estimator_status(view: View) -> Sequence[Any]:
     # 4.9 m after 10.8 s
     passed_s = autopilot.health.without_fix_s(autopilot.state.time_s)
     accuracy_m = 0.3 + (0.05 * passed_s + 0.035 * passed_s**2 if math.isfinite(passed_s) else 0.0)
+    position_ratio = autopilot.health.position_ratio(0.03)
     return (
-        view.time_us, flags, velocity_ratio, 0.03, 0.03, 0.14, 0.02, math.nan, accuracy_m, 0.31
+        view.time_us, flags, velocity_ratio, position_ratio, 0.03, 0.14, 0.02, math.nan,
+        accuracy_m, 0.31,
     )  # fmt: skip
 
 

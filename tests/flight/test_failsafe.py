@@ -182,10 +182,13 @@ def accuracy(flight: FlightState, accuracies_m: tuple[float | None, float | None
 
 def repeats(flight: FlightState, for_s: float) -> None:
     """The innovation ratios of motion capture change, and then stay the same."""
-    reports = [EstimatorReport(frozenset(ESTIMATE), (("velocity", each),)) for each in (0.1, 0.2)]
-    for report, ago_s in zip((*reports, reports[1]), (for_s + 0.5, for_s, 0.0), strict=True):
+    ratios = (0.1, 0.2, 0.3, 0.4, 0.4)
+    reports = [EstimatorReport(frozenset(ESTIMATE), (("velocity", each),)) for each in ratios]
+    for number, (report, ago_s) in enumerate(
+        zip(reports, (2.0, 1.9, 1.8, for_s, 0.0), strict=True)
+    ):
         flight.vehicle.update(report, NOW_S - ago_s)
-        if ago_s:
+        if number == 0:
             flight.positioning.begin(flight.vehicle, {}, "EKF_STATUS_REPORT")
 
 
@@ -269,7 +272,7 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("positioning", accuracy, (None, None), (0.5, None)),
     ("positioning", valid, frozenset(ESTIMATE), frozenset(ESTIMATE[:1])),
     ("positioning", no_fix, 1.0, 2.1),
-    ("positioning", repeats, 1.0, 1.1),
+    ("positioning", repeats, 1.5, 1.6),
     ("innovations", rejected("horizontal position"), 1.0, 1.1),
     ("innovations", rejected("height"), 1.0, 1.1),
     ("volume", lambda flight, height_m: at(flight, 0.0, -height_m), 120.0, 120.1),
@@ -306,6 +309,23 @@ def test_a_gps_fix_that_the_estimator_does_not_use_may_be_lost() -> None:
         hear(flight, EstimatorReport(frozenset(ESTIMATE), (), 0.5, by_gps=by_gps))
         no_fix(flight, 2.1)
         assert bool(BY_NAME["positioning"].condition(flight)) is by_gps
+
+
+def test_rejected_measurements_count_only_if_repeated_and_without_gps() -> None:
+    """Reports at 1 Hz for 3 s; autopilots fly through a glitch of GPS."""
+    report = EstimatorReport(frozenset(ESTIMATE), (("velocity", 1.2),))
+    for reports, fix, action in ((1, False, Action.FLY), (3, False, Action.LAND),
+                                 (3, True, Action.FLY)):  # fmt: skip
+        flight, worst = uneventful(), Action.FLY
+        if fix:
+            hear(flight, GpsFix())
+        for step in range(60):
+            flight.vehicle.now_s = NOW_S + 0.05 * step
+            if step % 20 == 0 and step < 20 * reports:
+                flight.vehicle.update(report, flight.vehicle.now_s)
+            judge(flight, [BY_NAME["innovations"]])
+            worst = max(worst, flight.failsafe.action)
+        assert worst is action
 
 
 def test_begin_with_other_sender_allows_another_program() -> None:

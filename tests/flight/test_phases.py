@@ -258,6 +258,13 @@ def test_every_phase_row_is_taken_when_its_condition_holds(service: ServiceOptio
             assert "{" not in row.why(flight) + row.cause.format(flight=flight)
 
 
+def test_refusal_of_an_earlier_mode_request_is_no_refused_hold() -> None:
+    """Both are MAV_CMD_DO_SET_MODE."""
+    flight = uneventful(Phase.HOLD)
+    hear(flight, CommandAck(176, "TEMPORARILY_REJECTED"))
+    assert next_row(flight) is None
+
+
 def test_start_is_reached_only_at_rest() -> None:
     for there, changed in (
         (True, _set()),

@@ -47,20 +47,21 @@ from simulator.firmware.ardupilot import ARDUPILOT
 
 TAKEOFF = 22  # MAV_CMD
 SYS_STATUS, ESTIMATOR_STATUS = 1, 230
+LOW_BATTERY = scenario_of({"fault": "battery_drop", "remaining": 0.5})
 STILL_ARMED = "it has stood still for 15 s and is armed: its land detector reports that it flies"
 CLOCK_SET_BACK = {"fault": "clock_jump", "jump_s": -3, "after": "landing", "at_s": 0.5}
 
 
-def flown_by_external_vision() -> Filter:
-    """Return a filter that makes a PX4 report no use of GPS, and pre-arm checks that pass in
-    OFFBOARD only: AUTO.LOITER needs a global position."""
+def flown_by_external_vision(gps: bool = False) -> Filter:
+    """Return a filter that makes a PX4 report no use of GPS (unless `gps`), and pre-arm checks that
+    pass in OFFBOARD only: AUTO.LOITER needs a global position."""
     modes = [0]
 
     def change(message: Any) -> None:
         if message.get_msgId() == faults.HEARTBEAT:
             modes[0] = message.custom_mode
         elif message.get_msgId() == ESTIMATOR_STATUS:
-            message.flags &= ~512
+            message.flags &= ~0 if gps else ~512
         elif modes[0] != 6 << 16:
             message.onboard_control_sensors_health &= ~0x10000000
 
@@ -412,6 +413,14 @@ ROWS = {
     ),
     "PX4 by external vision, whose pre-arm checks pass only in OFFBOARD": flies(
         whole, down=flown_by_external_vision()
+    ),
+    "pre-arm checks of a PX4 by GPS do not pass": refusal(
+        "not ready: its pre-arm checks do not pass in AUTO.LOITER", nothing_sent,
+        down=flown_by_external_vision(gps=True), limits={"health_s": 15.0},
+    ),
+    "PX4 by external vision with an empty battery": refusal(
+        "not ready: its pre-arm checks do not pass", nothing_sent, down=flown_by_external_vision(),
+        limits={"health_s": 15.0, "battery": 0.9}, scenario=LOW_BATTERY,
     ),
     "the land detector is not heard": refusal(
         r"not ready: it does not report whether it flies \(EXTENDED_SYS_STATE\)", nothing_sent,

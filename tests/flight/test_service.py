@@ -28,7 +28,7 @@ from serving import (
 from watch import announced, begun_s, said, sent_after
 
 from offboard.flight.authority import PilotSwitch
-from offboard.flight.phases import TRACKING, Phase
+from offboard.flight.phases import TRACKING, Limits, Phase
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from simulator import config as simulated
 
@@ -304,9 +304,14 @@ def test_the_volume_begins_at_the_take_off_point_wherever_the_pilot_engages(serv
     latitude, longitude, _ = pair.instance.autopilot.firmware.origin
     pair.ground(REPOSITION, 2, 1, 0, np.nan, latitude + 4e-5, longitude, np.nan)
     pair.run(8.0)
+    assert pair.place[0] > 4.0
+    pair.service.current.limits = Limits(radius_m=3.0)  # of this flight alone
+    pair.switch("engage")
+    pair.run(3.0)
+    assert said(pair, "not engaged: 3 m above and 5 m from the take-off point (limits.ceiling_m")
+    assert pair.state.vehicle.mode == "AUTO.LOITER"
     pair.engage()
     assert pair.state.from_takeoff_m == pytest.approx(pair.place * (1, 1, -1), abs=0.1)
-    assert pair.place[0] > 4.0
 
 
 def test_lost_supervisor_prevents_only_new_flights(served: Served) -> None:
