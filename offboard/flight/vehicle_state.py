@@ -209,7 +209,8 @@ class VehicleState:
             case SystemHealth():
                 self.health = event
             case EstimatorReport():
-                if self.estimator and event.horizontal_ratios != self.estimator.horizontal_ratios:
+                ratios = event.horizontal_ratios  # empty: the estimator uses no measurement
+                if self.estimator and ratios not in ([], self.estimator.horizontal_ratios):
                     self.measured_s, self.measurements = now_s, self.measurements + 1
                 self.estimator = event
             case Landed(state):

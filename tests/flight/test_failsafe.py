@@ -180,10 +180,11 @@ def accuracy(flight: FlightState, accuracies_m: tuple[float | None, float | None
     hear(flight, replace(reported, accuracy_m=accuracies_m[1]))
 
 
-def repeats(flight: FlightState, for_s: float) -> None:
-    """The innovation ratios of motion capture change, and then stay the same."""
-    ratios = (0.1, 0.2, 0.3, 0.4, 0.4)
-    reports = [EstimatorReport(frozenset(ESTIMATE), (("velocity", each),)) for each in ratios]
+def repeats(flight: FlightState, for_s: float, last: Any = (("velocity", 0.4),)) -> None:
+    """The innovation ratios of motion capture change, and then stay the same or, with a `last`
+    report without ratios, end."""
+    ratios: list[Any] = [(("velocity", each),) for each in (0.1, 0.2, 0.3, 0.4)]
+    reports = [EstimatorReport(frozenset(ESTIMATE), each) for each in (*ratios, last)]
     for number, (report, ago_s) in enumerate(
         zip(reports, (2.0, 1.9, 1.8, for_s, 0.0), strict=True)
     ):
@@ -273,6 +274,7 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("positioning", valid, frozenset(ESTIMATE), frozenset(ESTIMATE[:1])),
     ("positioning", no_fix, 1.0, 2.1),
     ("positioning", repeats, 1.5, 1.6),
+    ("positioning", partial(repeats, last=()), 1.5, 1.6),
     ("innovations", rejected("horizontal position"), 1.0, 1.1),
     ("innovations", rejected("height"), 1.0, 1.1),
     ("volume", lambda flight, height_m: at(flight, 0.0, -height_m), 120.0, 120.1),
