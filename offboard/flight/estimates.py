@@ -51,14 +51,18 @@ class Positioning:
 
     had_fix: bool = False  # which the estimator uses
     report: EstimatorReport | None = None
-    measurements: int = 0  # `VehicleState.measurements` at the beginning
+    without_gps: bool = False  # see `VehicleState.without_gps`
+    measured: bool = False  # whether the estimator used GPS or external vision
+    measurements: int = 0  # `VehicleState.measurements`
     fixes_silent_s: float = math.inf  # GPS_RAW_INT is missing after this time without a fix
     reports_silent_s: float = math.inf  # the same for EstimatorReport
 
     def begin(self, vehicle: VehicleState, rates_hz: Mapping[str, float], estimator: str) -> None:
         """Note what there is when the flight begins. `rates_hz` are the rates of the messages that
         arrive, by name; `estimator` is the name of the one that becomes an EstimatorReport."""
-        self.had_fix = vehicle.age_s(GpsFix) < KNOWN_S and not vehicle.without_gps
+        self.without_gps = vehicle.without_gps
+        self.had_fix = vehicle.age_s(GpsFix) < KNOWN_S and not self.without_gps
+        self.measured = vehicle.unmeasured_s < KNOWN_S
         self.measurements = vehicle.measurements
         self.fixes_silent_s = _silent_s(rates_hz.get("GPS_RAW_INT", 0.0))
         if vehicle.age_s(EstimatorReport) < KNOWN_S:
@@ -82,7 +86,8 @@ class Positioning:
                 return "its estimator reports no accuracy of the position any more"
             if now.accuracy_m > max(limits.accuracy_m, WORSE * before.accuracy_m):
                 return f"its estimated position is only accurate to {now.accuracy_m:.1f} m"
-        measures = vehicle.measurements - self.measurements >= MEASUREMENTS_MIN
+        counted = vehicle.measurements - self.measurements
+        measures = self.measured and counted >= MEASUREMENTS_MIN
         unmeasured_s = vehicle.unmeasured_s
         if measures and unmeasured_s > max(limits.gps_s, SLOWEST_S) + MARGIN_S:
             return f"its estimator has used no GPS or external vision for {unmeasured_s:.1f} s"

@@ -144,11 +144,11 @@ def measurements_rejected(flight: FlightState) -> str:
     """Innovation ratio of position, velocity or height, of an estimator without GPS.
 
     Autopilots fly through a glitch of GPS; in a room there is no space for that."""
-    vehicle = flight.vehicle
-    recent = vehicle.age_s(EstimatorReport) < ESTIMATOR_REPORT_S
-    if vehicle.estimator is None or not (recent and vehicle.without_gps):
+    report = flight.vehicle.estimator
+    recent = flight.vehicle.age_s(EstimatorReport) < ESTIMATOR_REPORT_S
+    if report is None or not (recent and flight.positioning.without_gps):
         return ""
-    return vehicle.estimator.rejects_motion
+    return report.rejects_motion
 
 
 def outside_volume(flight: FlightState) -> str:

@@ -229,15 +229,20 @@ class FlightState(Ground):
         """Time since the start of the track, not counting pauses; NaN before it."""
         return self.plan.track_time_s(self.time_s)
 
+    def last_rest_ned_m(self, place_ned_m: Triple) -> Triple:
+        """Where the vehicle last rested. If that was not seen: the point below `place_ned_m` at the
+        height of the local origin. Both are without the jumps of the estimate."""
+        return self.contact.rest_ned_m or (*place_ned_m[:2], self.contact.rest_down_m)
+
     @property
     def from_takeoff_m(self) -> Triple:
         """North, east and height of the newest position relative to the take-off point; without a
-        reference relative to the last rest, 0 if that was not seen."""
+        reference relative to the last rest."""
         position = self.vehicle.position
-        home_ned_m = self.home_ned_m if self.plan.reference else self.contact.rest_ned_m
-        if position is None or home_ned_m is None:
+        if position is None:
             return 0.0, 0.0, 0.0
         place_ned_m = self.jumps.without(position.position_ned_m)
+        home_ned_m = self.home_ned_m if self.plan.reference else self.last_rest_ned_m(place_ned_m)
         north, east, down = map(operator.sub, place_ned_m, home_ned_m)
         return north, east, -down
 

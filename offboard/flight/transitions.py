@@ -246,8 +246,9 @@ def _place_reference(flight: FlightState, position: LocalPosition) -> None:
     origin. With the anchor "here" the reference starts where the vehicle stops; with "origin" it is
     relative to the last rest, and in `fly` to the point below the vehicle."""
     contact, jumps = flight.contact, flight.jumps
-    below = (*jumps.without(position.position_ned_m)[:2], contact.rest_down_m)
-    flight.home_ned_m = contact.rest_ned_m or below
+    place_ned_m = jumps.without(position.position_ned_m)
+    flight.home_ned_m = flight.last_rest_ned_m(place_ned_m)
+    below = (*place_ned_m[:2], contact.rest_down_m)
     rest = contact.rest_ned_m and jumps.reported(contact.rest_ned_m)
     if flight.service and flight.service.anchor == "here":
         above_m = flight.plan.place_start(

@@ -105,7 +105,8 @@ class VehicleState:
 
     @property
     def without_gps(self) -> bool:
-        """Whether the estimator works without GPS: PX4 reports it, or no fix was ever heard."""
+        """Whether the estimator works without GPS. PX4 reports that since 1.16; of others it is
+        concluded if no fix was ever heard."""
         report = self.estimator
         return report is not None and not (report.by_gps and GpsFix in self.heard_s)
 

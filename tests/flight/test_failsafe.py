@@ -180,16 +180,16 @@ def accuracy(flight: FlightState, accuracies_m: tuple[float | None, float | None
     hear(flight, replace(reported, accuracy_m=accuracies_m[1]))
 
 
-def repeats(flight: FlightState, for_s: float, last: Any = (("velocity", 0.4),)) -> None:
+def repeats(flight: FlightState, for_s: float, last: Any = (("velocity", 0.5),)) -> None:
     """The innovation ratios of motion capture change, and then stay the same or, with a `last`
     report without ratios, end."""
-    ratios: list[Any] = [(("velocity", each),) for each in (0.1, 0.2, 0.3, 0.4)]
+    ratios: list[Any] = [(("velocity", each),) for each in (0.1, 0.2, 0.3, 0.4, 0.5)]
     reports = [EstimatorReport(frozenset(ESTIMATE), each) for each in (*ratios, last)]
     for number, (report, ago_s) in enumerate(
-        zip(reports, (2.0, 1.9, 1.8, for_s, 0.0), strict=True)
+        zip(reports, (2.1, 2.0, 1.9, 1.8, for_s, 0.0), strict=True)
     ):
         flight.vehicle.update(report, NOW_S - ago_s)
-        if number == 0:
+        if number == 1:
             flight.positioning.begin(flight.vehicle, {}, "EKF_STATUS_REPORT")
 
 
@@ -201,9 +201,12 @@ def no_fix(flight: FlightState, for_s: float) -> None:
 
 def rejected(name: str) -> Any:
     """A heading that is rejected, too, does not count."""
-    return lambda flight, ratio: hear(
-        flight, EstimatorReport(frozenset(ESTIMATE), (("heading", 2.0), (name, ratio)))
-    )
+
+    def measure(flight: FlightState, ratio: float) -> None:
+        hear(flight, EstimatorReport(frozenset(ESTIMATE), (("heading", 2.0), (name, ratio))))
+        flight.positioning.begin(flight.vehicle, {}, "ESTIMATOR_STATUS")
+
+    return measure
 
 
 def sinks(flight: FlightState, sink_mps: float) -> None:
@@ -325,6 +328,8 @@ def test_rejected_measurements_count_only_if_repeated_and_without_gps() -> None:
             flight.vehicle.now_s = NOW_S + 0.05 * step
             if step % 20 == 0 and step < 20 * reports:
                 flight.vehicle.update(report, flight.vehicle.now_s)
+            if step == 0:
+                flight.positioning.begin(flight.vehicle, {}, "ESTIMATOR_STATUS")
             judge(flight, [BY_NAME["innovations"]])
             worst = max(worst, flight.failsafe.action)
         assert worst is action

@@ -314,6 +314,16 @@ def test_the_volume_begins_at_the_take_off_point_wherever_the_pilot_engages(serv
     assert pair.state.from_takeoff_m == pytest.approx(pair.place * (1, 1, -1), abs=0.1)
 
 
+def test_service_started_in_the_air_refuses_a_vehicle_above_the_ceiling(served: Served) -> None:
+    """The take-off point was not seen; heights are above the local origin."""
+    pair = served.aloft()
+    pair.service.current.limits = Limits(ceiling_m=2.5)
+    pair.switch("engage")
+    pair.run(3.0)
+    assert said(pair, "not engaged: 3 m above and 0 m from the take-off point (limits.ceiling_m")
+    assert pair.state.vehicle.mode == "AUTO.LOITER"
+
+
 def test_lost_supervisor_prevents_only_new_flights(served: Served) -> None:
     pair = served.engaged()
     pair.service.current.guard(False)
