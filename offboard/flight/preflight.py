@@ -357,9 +357,11 @@ def _estimate_level(ground: Ground) -> Level:
 
 
 def _outside_volume(ground: Ground) -> str:
-    limits = ground.limits
-    named = f" (limits.ceiling_m is {limits.ceiling_m:g}, limits.radius_m is {limits.radius_m:g})"
-    return ground.outside_volume and ground.outside_volume + named
+    limits, where = ground.limits, ground.outside_volume
+    if not (where and ground.in_the_air):  # a vehicle on the ground is at its take-off point
+        return ""
+    named = f"limits.ceiling_m is {limits.ceiling_m:g}, limits.radius_m is {limits.radius_m:g}"
+    return f"{where} ({named})"
 
 
 def _empty_battery(ground: Ground) -> str:
@@ -432,7 +434,7 @@ PREFLIGHT = (
     Row("prearm", WAIT, _prearm, _prearm_fix, fly_only=True),
     Row("prearm", WARN, _needs_setpoints, _other_mode, fly_only=True),
     Row("battery", BLOCKS, _empty_battery, "charge the battery"),
-    Row("volume", BLOCKS, _outside_volume, "fly nearer to it, or raise the limits"),
+    Row("volume", BLOCKS, _outside_volume, "fly nearer to that point, or raise the limits"),
     Row("delay", WAIT, _measuring),
     Row("delay", BLOCKS, _late, "use a faster link"),
 )
