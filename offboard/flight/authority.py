@@ -56,8 +56,8 @@ class Authority:
     engage_mode: str = ""
     standing: Standing = Standing.FREE
     mode: str = "unknown"
-    heard_s: float = -math.inf  # time of the newest report
-    reported_s: float = -math.inf  # time of the newest report that counts
+    report_s: float = -math.inf  # time of the newest report
+    counted_report_s: float = -math.inf  # time of the newest report that counts
     lost_reason: str = ""
     lost_s: float = math.inf  # time of the loss; -inf if a HEARTBEAT reported it
     setpoint_loss: SetpointLoss = NEVER  # what the autopilot does without setpoints
@@ -89,9 +89,9 @@ class Authority:
         the pilot may fly it in that failsafe (None: not known).
         """
         before, self.mode = self.mode, mode
-        self.heard_s, self.arrived_s = now_s, arrived_s
+        self.report_s, self.arrived_s = now_s, arrived_s
         if arrived_s >= self._counts_from_s:
-            self.reported_s = now_s
+            self.counted_report_s = now_s
         if self.standing is Standing.ASKED:
             if mode == self.engage_mode:
                 self.standing = Standing.OURS
@@ -172,12 +172,12 @@ class Authority:
         self._counts_from_s = host_s - (JUST_S if paused_s < self.setpoint_loss.after_s else 0.0)
         self._failsafe_shown = False
         if self.arrived_s < self._counts_from_s:
-            self.reported_s = -math.inf
+            self.counted_report_s = -math.inf
 
     def forget(self, now_s: float) -> None:
         """Forget the reports of the mode, because the vehicle was rebooted. Only the next report
         shows whether a vehicle that was ours has changed its mode."""
-        self.heard_s, self.reported_s = now_s, -math.inf
+        self.report_s, self.counted_report_s = now_s, -math.inf
         if self.is_ours:
             self.standing = Standing.OURS
 
@@ -190,15 +190,15 @@ class Authority:
 
     def _known(self, now_s: float) -> bool:
         """Whether the newest report that counts is recent enough to act on."""
-        return now_s - self.reported_s <= MODE_KNOWN_S
+        return now_s - self.counted_report_s <= MODE_KNOWN_S
 
     def heard(self, now_s: float) -> bool:
         """Whether reports of the mode arrive, even if none counts yet."""
-        return now_s - self.heard_s <= MODE_KNOWN_S
+        return now_s - self.report_s <= MODE_KNOWN_S
 
     def unheard_s(self, now_s: float) -> float:
         """Time since the newest report of the mode if it is longer than MODE_KNOWN_S; else 0."""
-        return 0.0 if self.heard(now_s) else now_s - self.heard_s
+        return 0.0 if self.heard(now_s) else now_s - self.report_s
 
     def permits_setpoint(self, now_s: float) -> bool:
         """Whether a setpoint may be sent: to a vehicle that follows it, or for the stream that PX4

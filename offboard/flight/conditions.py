@@ -64,7 +64,7 @@ def blind(flight: FlightState) -> str:
 def mode_unknown(flight: FlightState) -> str:
     if flight.authority.heard(flight.now_s):
         return ""
-    return f"no report of the mode for {flight.now_s - flight.authority.heard_s:.1f} s"
+    return f"no report of the mode for {flight.now_s - flight.authority.report_s:.1f} s"
 
 
 # ---------------------------------------------------------------------- who has the vehicle

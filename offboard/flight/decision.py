@@ -54,10 +54,10 @@ def begin(flight: FlightState) -> None:
 def decide(flight: FlightState) -> bool:
     """Decide, and queue the setpoint.
 
-    Returns False, and increases `missed`, if the decision failed or was refused; then nothing is
-    sent. Two cases return False and do not increase `missed`: telemetry that was too old before the
-    decision began, for which the failsafe has a row, and an observer that has no position or no
-    attitude yet, because a service may be engaged again right after a flight.
+    Returns False, and increases `missed_decisions`, if the decision failed or was refused; then
+    nothing is sent. Two cases return False and do not increase it: telemetry that was too old
+    before the decision began, for which the failsafe has a row, and an observer that has no
+    position or no attitude yet, because a service may be engaged again right after a flight.
     """
     if not flight.observer.ready:
         return False
@@ -91,13 +91,13 @@ def finish(flight: FlightState, sent_s: float) -> None:
         _miss(flight, located(error), "controller", DECISION_FAILED)
         return
     if not decided.refused:
-        flight.missed = 0
+        flight.missed_decisions = 0
         if flight.identification:
             _identify(flight, flight.identification)
 
 
 def _miss(flight: FlightState, failure: str, cause: str, begins: str = DECISION_MISSED) -> None:
-    flight.missed += 1
+    flight.missed_decisions += 1
     flight.failure, flight.failure_cause = f"{_BY[cause]}: {failure}", cause
     outbox.warn(flight, f"{begins}{failure}")
 
@@ -213,7 +213,7 @@ def tick_record(flight: FlightState, decided: Decided, answer_s: float) -> TickR
         *certificate,
         decided.solve_time_s,
         answer_s,
-        float(flight.busyness.missed),
+        float(flight.busyness.newly_skipped),
         *state.position_ned_m.tolist(),
         *state.velocity_ned_mps.tolist(),
         *state.disturbance_ned_mps2.tolist(),

@@ -65,12 +65,12 @@ def unanswered(flight: FlightState) -> str:
 
 def decision_missed(flight: FlightState) -> str:
     """A decision failed, came too late, or was refused by the last check of the setpoint."""
-    return flight.failure if flight.missed else ""
+    return flight.failure if flight.missed_decisions else ""
 
 
 def decisions_missed(flight: FlightState) -> str:
     """Number of decisions missed in a row."""
-    return flight.failure if flight.missed >= flight.limits.missed_decisions else ""
+    return flight.failure if flight.missed_decisions >= flight.limits.missed_decisions else ""
 
 
 def tilted(flight: FlightState) -> str:

@@ -101,7 +101,7 @@ class Flight(FlightState):
         session = self.session
         before_s, self.host_s = self.host_s, session.elapsed_s(host_now_s)
         if math.isnan(before_s):
-            before_s = self.heard_s = self.host_s
+            before_s = self.telemetry_host_s = self.host_s
         paused_s = self.host_s - before_s
         self.note_missing_setpoints()
         if session.settings.lockstep:
@@ -151,7 +151,7 @@ class Flight(FlightState):
             # `limits.land_s` does not run while the vehicle is not heard
             self.began_s += self.now_s - before_s
         if self._heard:
-            self.heard_s = session.elapsed_s(host_now_s)
+            self.telemetry_host_s = session.elapsed_s(host_now_s)
             self.bridged_s = 0.0
         return due
 
@@ -162,9 +162,9 @@ class Flight(FlightState):
         number = math.floor(self.time_s / self.period_s + 1e-6)
         if number <= self._tick:
             return False
-        missed = number - self._tick - 1 if self._tick >= 0 else 0
+        skipped = number - self._tick - 1 if self._tick >= 0 else 0
         self._tick, self._ticked = number, True
-        self.busyness.on_tick(missed, flying=self.phase in FLYING)
+        self.busyness.on_tick(skipped, flying=self.phase in FLYING)
         ignored = self.other_datagrams + self.session.senders.forged.total()
         self.ignored, self._recorded_others = ignored - self._recorded_others, ignored
         return True

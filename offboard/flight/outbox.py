@@ -224,11 +224,11 @@ def request(flight: FlightState, request: CommandLong) -> bool:
     """
     result = flight.vehicle.results.get(request.command)
     requested_s, host_s = flight.requested_s.get(request, NEVER)
-    waits = flight.now_s - requested_s < REPEAT_S - 1e-6 or flight.authority.heard_s < requested_s
+    waits = flight.now_s - requested_s < REPEAT_S - 1e-6 or flight.authority.report_s < requested_s
     # A TIMESYNC request is sent at each tick, and without telemetry there are no ticks
     has_ticks = flight.vehicle.has_state and flight.silence_s < REPEAT_S
     is_answered = has_ticks and flight.clock.unanswered_s(flight.host_s) < ANSWERS_S
-    waits = waits or (is_answered and flight.reported_s < host_s)
+    waits = waits or (is_answered and flight.mode_after_s < host_s)
     done = math.isfinite(requested_s) and result in GOOD_RESULTS
     if waits or done or not flight.authority.permits_command(flight.now_s):
         return False

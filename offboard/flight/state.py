@@ -58,7 +58,7 @@ MISSING_KNOWN_S = 3.0  # time in which HEARTBEAT, at 1 Hz, shows the failsafe fo
 # attributes that continue those of the flight before, with the same vehicle
 KEPT = (
     "vehicle", "contact", "clock", "hover", "jumps", "reading", "other_datagrams", "host_s",
-    "heard_s", "guarded", "announced", "announcements",
+    "telemetry_host_s", "guarded", "announced", "announcements",
 )  # fmt: skip
 
 
@@ -117,18 +117,20 @@ class FlightState(Ground):
     outcome: Outcome | None = None
 
     busyness: Busyness = field(init=False)  # of this computer
-    heard_s: float = math.nan  # host time of the turn in which the newest telemetry arrived
+    telemetry_host_s: float = (
+        math.nan
+    )  # host time of the turn in which the newest telemetry arrived
     telemetry_arrived_s: float = 0.0  # monotonic host time of that arrival, in lockstep too
     # `clock.answered_s` at the newest report of the mode: the vehicle had received what was sent
     # until then when it sent this report
-    reported_s: float = -math.inf
+    mode_after_s: float = -math.inf
     bridged_s: float = 0.0  # `silence_s` at the newest setpoint that was sent without telemetry
     ignored: int = 0  # datagrams of others and forged frames between the two newest ticks
     command: Command = field(default_factory=lambda: Command(0.0, LEVEL_DIRECTION, 0.0))  # in force
     newest_setpoint: AttitudeTarget | PositionTarget | None = None  # None once it was repeated
     decided: Decided | None = None  # the decision of this turn
     told_radps: tuple[float, ...] = (math.nan, math.nan)  # the bandwidth that was announced last
-    missed: int = 0  # number of decisions in a row that were not sent
+    missed_decisions: int = 0  # in a row that were not sent
     failure: str = ""  # what prevented the newest of them
     failure_cause: str = ""  # in a word: controller, link or computer
     commands: deque[Command] = field(default_factory=lambda: deque(maxlen=COMMANDS_KEPT))
@@ -184,9 +186,10 @@ class FlightState(Ground):
 
     @property
     def silence_s(self) -> float:
-        """Host time since the newest telemetry; 0 before the first turn. In lockstep `heard_s` may
-        be later than `host_s`, because simulated time advances within the turn."""
-        return max(0.0, self.host_s - self.heard_s)
+        """Host time since the newest telemetry; 0 before the first turn. In lockstep
+        `telemetry_host_s` may be later than `host_s`, because simulated time advances within the
+        turn."""
+        return max(0.0, self.host_s - self.telemetry_host_s)
 
     @property
     def in_the_air(self) -> bool:

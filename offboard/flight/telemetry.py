@@ -195,7 +195,7 @@ def _on_mode(
         flight.authority = Authority(dialect.engage_mode)
     vehicle, authority = flight.vehicle, flight.authority
     authority.setpoint_loss = dialect.setpoint_loss(vehicle.parameters)
-    flight.reported_s = flight.clock.answered_s
+    flight.mode_after_s = flight.clock.answered_s
     authority.on_mode(
         mode,
         flight.now_s,

@@ -284,26 +284,26 @@ class Busyness:
     """Counts skipped ticks and pauses of this process in flight. `period_s` is the control period;
     a shorter gap between two turns skips no tick.
 
-    `missed` is the number of ticks skipped before the newest one, and `paused_s` the length of the
-    pause before it, 0 without a pause."""
+    `newly_skipped` is the number of ticks skipped just before the newest one, and `paused_s` the
+    length of the pause before it, 0 without a pause."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
         self._gap_s = 0.0  # longest between two turns, since the previous tick
-        self.skipped = self.ticks = self.missed = 0
+        self.skipped = self.ticks = self.newly_skipped = 0
         self.pause_s = self.paused_s = 0.0
 
     def on_turn(self, gap_s: float) -> None:
         """Note that a turn begins `gap_s` of host time after the one before it."""
         self._gap_s = max(self._gap_s, gap_s)
 
-    def on_tick(self, missed: int, *, flying: bool) -> None:
-        """Count a tick, before which `missed` ticks were skipped."""
-        self.missed = missed
+    def on_tick(self, skipped: int, *, flying: bool) -> None:
+        """Count a tick, before which `skipped` ticks were skipped."""
+        self.newly_skipped = skipped
         self.paused_s, self._gap_s = self._gap_s if self._gap_s > self._period_s else 0.0, 0.0
         if flying:
-            self.ticks += 1 + missed
-            self.skipped += missed if self.paused_s else 0
+            self.ticks += 1 + skipped
+            self.skipped += skipped if self.paused_s else 0
             self.pause_s = max(self.pause_s, self.paused_s)
 
     @property

@@ -116,10 +116,10 @@ class Displays:
         for page in self._pages:
             page.head(verdict=verdict, report=report)
 
-    def show(self, companion: Flight) -> None:
+    def show(self, flight: Flight) -> None:
         for part in tuple(self._working):
             try:
-                part.show(companion)
+                part.show(flight)
             except (Exception, SystemExit):  # rich raises SystemExit on a closed pipe
                 self._working.remove(part)
 

@@ -71,7 +71,7 @@ class Senders:
     is that of the vehicle. `systems` has the time at which each autopilot was heard, to a second;
     `twin_s` the time at which one with the vehicle's system id was heard from another address.
     `forged` counts the frames that signing refused. Times are `Session.link_time_s`, except
-    `heard_s`: `Session.elapsed_s` of the vehicle's newest frame.
+    `newest_frame_s`: `Session.elapsed_s` of the vehicle's newest frame.
     """
 
     def __init__(self, wanted: int | None, component_id: int, signing: Signing | None) -> None:
@@ -86,7 +86,7 @@ class Senders:
         self._news_at = 1  # number of forged frames at which `news` reports next
         self._signs = False  # whether an autopilot that signs was heard although we have no key
         self._other_component = 0  # newest component id of an autopilot with another one than 1
-        self.heard_s = 0.0
+        self.newest_frame_s = 0.0
         self._wanted = wanted
         self._signing = signing
         # address of the vehicle, or of an autopilot whose signing time is behind
@@ -104,7 +104,7 @@ class Senders:
     def moves_to(self, peer: Hashable, now_s: float, datagram: bytes) -> bool:
         """Make `peer` the vehicle's address if the known one is silent and `datagram`, from `peer`,
         has a frame of the vehicle. Returns whether the address has changed."""
-        if now_s - self.heard_s <= PEER_SILENT_S or not same_host(peer, self.peer):
+        if now_s - self.newest_frame_s <= PEER_SILENT_S or not same_host(peer, self.peer):
             return False
         vehicle = self.vehicle
         assert vehicle is not None

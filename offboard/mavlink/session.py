@@ -141,7 +141,7 @@ class Session:
         """Add to `found` the event of a frame of the vehicle, or the reply to its TIMESYNC request
         (which may arrive before the vehicle is found)."""
         if self.dialect is not None:
-            self.senders.heard_s = now_s
+            self.senders.newest_frame_s = now_s
             if self.telemetry.dialect is None:
                 self._heartbeat_sent = None  # send one at once, with the vehicle's system id
                 self.telemetry.begin(self.dialect)

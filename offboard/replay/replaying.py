@@ -1,5 +1,5 @@
 """Replays a flight: reads configuration, inputs of each turn and frames from a .tlog, creates the
-`Flight` of the recording (`companion`), and runs its turns with the recorded inputs.
+`Flight` of the recording, and runs its turns with the recorded inputs.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class Replay:
 
     def __init__(self, recording: Recording) -> None:
         self.config = flown(recording.configuration)
-        self.companion = self._companion(recording, build(self.config))
+        self.flight = self._new_flight(recording, build(self.config))
         self.recorded: list[Sent] = []
         self.replayed: list[Sent] = []
         self.stopped = ""
@@ -133,7 +133,7 @@ class Replay:
         self._readings: Iterator[float] = iter(())
         self._read_s = 0.0
 
-    def _companion(self, recording: Recording, prepared: Prepared) -> Flight:
+    def _new_flight(self, recording: Recording, prepared: Prepared) -> Flight:
         settings: dict[str, Any] = recording.settings
         signing = Accepted(bytes(KEY_BYTES)) if recording.signed else None
         try:
@@ -142,7 +142,7 @@ class Replay:
             raise UserError(
                 f"{recording.log.path}: the settings of its session are those of another version"
             ) from None
-        return prepared.companion(session, self._stopwatch)
+        return prepared.flight(session, self._stopwatch)
 
     @property
     def incomplete(self) -> str:
@@ -167,18 +167,18 @@ class Replay:
         except InputsError as error:
             self.stopped = str(error)
         self._drain()
-        if self.stopped or not self.companion.has_ended():
+        if self.stopped or not self.flight.has_ended():
             self._cut()
 
     def _obey(self, kind: str, value: Any, *arguments: Any) -> None:
         """Replay an entry between two turns."""
         if kind == DROPPED:
             del self.replayed[len(self.replayed) - value :]  # the newest turn has encoded them
-            self.companion.on_dropped(value)
+            self.flight.on_dropped(value)
         elif kind == OTHERS:
-            self.companion.other_datagrams = value
+            self.flight.other_datagrams = value
         elif kind == CALL and value in CALLS:
-            getattr(self.companion, value)(*arguments)
+            getattr(self.flight, value)(*arguments)
         elif kind == CHECK:
             if value != self._crc:
                 raise InputsError("received frames are missing or damaged")
@@ -203,15 +203,15 @@ class Replay:
         self._readings, self._read_s = iter(given.readings_s), given.now_s
         self.count += 1
         frames = self._frames(chunks, given.now_s)
-        self.ended_s = self.companion.time_s
+        self.ended_s = self.flight.time_s
         if frames is not None:
             self.replayed += map(self._sent, frames)
-            self.companion.finish_turn(math.nan)  # a replay sends nothing, at no time
+            self.flight.finish_turn(math.nan)  # a replay sends nothing, at no time
         return given, received
 
     def _frames(self, chunks: list[Chunk], now_s: float) -> tuple[bytes, ...] | None:
         try:
-            return self.companion.turn(chunks, now_s)
+            return self.flight.turn(chunks, now_s)
         except (Exception, SystemExit):  # the loop did the same, and then requested the landing
             return None
 
@@ -222,7 +222,7 @@ class Replay:
 
     def _sent(self, frame: bytes) -> Sent:
         kind, payload = message_id_of(frame), payload_of(frame)
-        return Sent(self.companion.time_s, kind, payload, self.count)
+        return Sent(self.flight.time_s, kind, payload, self.count)
 
     # ------------------------------------------------------------------ the log
 
@@ -239,7 +239,7 @@ class Replay:
 
     def _note(self, message: LoggedMessage) -> bool:
         """Store a message of the log if we sent it. Return whether it is one of ours."""
-        if message.system_id != self.companion.session.senders.own.system_id:
+        if message.system_id != self.flight.session.senders.own.system_id:
             return False
         if message.component_id == RECORD_COMPONENT_ID:
             return True
@@ -253,7 +253,7 @@ class Replay:
     def _note_thrust(self, message: LoggedMessage) -> None:
         """Store the thrust of a recorded setpoint: the vehicle reports this thrust in the recorded
         telemetry, whatever the replay sends."""
-        thrusts = self.companion.thrusts
+        thrusts = self.flight.thrusts
         if message.name == "SET_ATTITUDE_TARGET":
             thrusts.append(message.message.thrust)
         elif message.name.startswith("SET_POSITION_TARGET"):

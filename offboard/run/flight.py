@@ -174,7 +174,7 @@ class Prepared:
     track: Track
     text: str
 
-    def companion(
+    def flight(
         self,
         session: Session,
         stopwatch: Callable[[], float],
@@ -302,7 +302,7 @@ def fly(
     *,
     simulator: SimulatorProcess | InMemorySimulator | None = None,
     stops: StopRequests | None = None,
-    progress: Callable[[Flight], None] = lambda companion: None,
+    progress: Callable[[Flight], None] = lambda flight: None,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> Outcome:
     """Fly `config` once with `vehicle` and log the flight in `directory`.
@@ -344,7 +344,7 @@ def fly(
         for piece in configuration_pieces(prepared.text):
             log.begin(clock.unix_us(), session.encode(piece))
         loop = Loop(
-            prepared.companion(session, clock.monotonic_s),
+            prepared.flight(session, clock.monotonic_s),
             link,
             log,
             stops=stops,

@@ -1,5 +1,5 @@
-"""The loop of a flight: passes received bytes to the companion (a `Flight`, or the flights of a
-service), and its frames to link and log. The telemetry of the vehicle paces it."""
+"""The loop of a flight: passes received bytes to the flight, or to the service, and its frames to
+link and log. The telemetry of the vehicle paces it."""
 
 from __future__ import annotations
 
@@ -51,16 +51,16 @@ class Log(Protocol):
 
 
 class Loop:
-    """Moves bytes between one link, one companion and one log until the flight ends.
+    """Moves bytes between one link, one flight (or the service) and one log until the flight ends.
 
-    `progress` is called often, to show the companion's announcements to the user; it must not wait.
+    `progress` is called often, to show the flight's announcements to the user; it must not wait.
     A flight in the bundled `simulator` ends after `patience_s` of wall time without a datagram. All
     other vehicles have a `supervisor`, a process that outlives this one.
     """
 
     def __init__(
         self,
-        companion: Flown,
+        flown: Flown,
         link: Link,
         log: Log,
         *,
@@ -70,7 +70,7 @@ class Loop:
         patience_s: float = math.inf,
         supervisor: Supervisor | None = None,
     ) -> None:
-        self._companion = companion
+        self._flown = flown
         self._link = link
         self._log = log
         self._stops = stops
@@ -93,11 +93,11 @@ class Loop:
         if not gc.get_freeze_count():  # an earlier flight in this process may have done this
             gc.freeze()
         self._succeeded_s = self._heard_s = clock.monotonic_s()
-        while not (self._companion.has_ended() or self._stops.repeated or self._ended_early):
+        while not (self._flown.has_ended() or self._stops.repeated or self._ended_early):
             try:
                 self._turn()
                 self._succeeded_s = clock.monotonic_s()
-                if self._companion.current.phase in WAITING:
+                if self._flown.current.phase in WAITING:
                     self._error = ""  # the flight that the error ended is over
             except BaseException as error:  # a control law may even raise SystemExit
                 if not self._stops.repeated:  # a third signal interrupts a law that hangs
@@ -117,25 +117,25 @@ class Loop:
         if self._taken_over():
             return
         if self._stops.requested:
-            self._companion.request_stop()
+            self._flown.request_stop()
         chunks = self._link.receive()
         began_s = clock.monotonic_s()
         if chunks:
             self._heard_s = began_s
-        frames = self._companion.turn(chunks, began_s)
+        frames = self._flown.turn(chunks, began_s)
         if self._taken_over():
             return
         dropped = self._send(frames, began_s)
         stamp = clock.unix_us()
-        for frame in self._companion.current.finish_turn(clock.monotonic_s()):
+        for frame in self._flown.current.finish_turn(clock.monotonic_s()):
             if frame not in dropped:
                 self._log.write(stamp, frame)
         report = self._link.report
-        self._companion.current.other_datagrams = report.ignored
-        self._companion.current.overhear(report.overheard)
+        self._flown.current.other_datagrams = report.ignored
+        self._flown.current.overhear(report.overheard)
         report.overheard = []
         for sentence in report.news():
-            self._companion.current.announce(sentence)
+            self._flown.current.announce(sentence)
         self._check_log()
         self._check_supervisor()
         self._show()
@@ -144,7 +144,7 @@ class Loop:
     def _send(self, frames: Sequence[bytes], began_s: float) -> list[bytes]:
         """Send the frames of a turn that began at host time `began_s`. With a supervisor, drop and
         return those that are more than SEND_WITHIN_S late, because this process was stopped."""
-        peer = self._companion.current.session.peer
+        peer = self._flown.current.session.peer
         dropped: list[bytes] = []
         for frame in frames:
             if self._supervisor and clock.monotonic_s() - began_s > SEND_WITHIN_S:
@@ -152,10 +152,10 @@ class Loop:
             else:
                 self._link.send(frame, peer)
         if dropped:
-            self._companion.current.on_dropped(len(dropped))
+            self._flown.current.on_dropped(len(dropped))
         if peer is not None:
             self._link.follow(peer)
-            if self._supervisor and (supervised := self._companion.current.supervised):
+            if self._supervisor and (supervised := self._flown.current.supervised):
                 self._supervisor.beat(supervised, peer, self._link, self._log.descriptor)
         return dropped
 
@@ -164,7 +164,7 @@ class Loop:
     def _check_supervisor(self) -> None:
         """Announce whether the supervisor guards the flight. Restart one that has ended, but only
         in a phase in `WAITING`: a restart blocks the loop for some milliseconds."""
-        supervisor, current = self._supervisor, self._companion.current
+        supervisor, current = self._supervisor, self._flown.current
         if supervisor is None or supervisor.has_taken_over():  # it may have during this turn
             return
         guards = supervisor.guards
@@ -204,7 +204,7 @@ class Loop:
         sentence = f"internal error: {located(error)}"
         self._error = self._error or sentence
         with suppress(BaseException):
-            self._companion.request_stop(self._error)
+            self._flown.request_stop(self._error)
         if self._simulator or clock.monotonic_s() - self._succeeded_s > FAILING_S:
             self._ended_early = Outcome(ExitCode.ABORTED, f"{self._error}; setpoints stopped")
 
@@ -212,25 +212,25 @@ class Loop:
         problem = self._log.problem
         if problem:
             self._warn(problem)
-            if self._companion.current.limits.log_lost == "land":
-                self._companion.request_stop(problem)
+            if self._flown.current.limits.log_lost == "land":
+                self._flown.request_stop(problem)
 
     def _warn(self, sentence: str) -> None:
         """Announce `sentence`, once in the life of this loop."""
         if sentence not in self._warned:
             self._warned.add(sentence)
-            self._companion.current.announce(sentence)
+            self._flown.current.announce(sentence)
 
     def _show(self) -> None:
         """Call `progress`. If it fails, it is not called again, and the flight goes on."""
         try:
-            self._progress(self._companion)
+            self._progress(self._flown)
         except (Exception, SystemExit):
-            self._progress = lambda companion: None
+            self._progress = lambda flight: None
 
     def _check_simulator(self, silent_s: float) -> None:
         """End the flight if the bundled simulator has ended, or has not sent for `patience_s`."""
-        if self._simulator is None or self._companion.has_ended():
+        if self._simulator is None or self._flown.has_ended():
             return
         ending = self._simulator.ending()
         if ending is None and silent_s > self._patience_s:
@@ -238,7 +238,7 @@ class Loop:
         if ending is None:
             return
         code = ExitCode.ABORTED
-        if self._companion.current.phase in BEFORE_FLIGHT:
+        if self._flown.current.phase in BEFORE_FLIGHT:
             code = ExitCode.USAGE if ending.unusable else ExitCode.REFUSED
         self._ended_early = Outcome(code, ending.sentence)
 
@@ -247,8 +247,8 @@ class Loop:
     def _outcome(self) -> Outcome:
         """Close the log, so that the number of lost entries is final, and return the outcome."""
         self._log.close()
-        outcome = self._ended_early or self._companion.current.outcome
-        ended = self._companion.has_ended() or self._companion.current.in_end_phase
+        outcome = self._ended_early or self._flown.current.outcome
+        ended = self._flown.has_ended() or self._flown.current.in_end_phase
         if outcome is None or not (self._ended_early or ended):
             outcome = self._interrupted(outcome)
         code, sentence = outcome.exit_code, outcome.sentence
@@ -256,7 +256,7 @@ class Loop:
             code = ExitCode.ABORTED
             sentence = sentence if self._error in sentence else f"{self._error}; {sentence}"
         if self._log.problem:
-            lands = self._companion.current.limits.log_lost == "land"
+            lands = self._flown.current.limits.log_lost == "land"
             code = code or (ExitCode.ABORTED if lands else ExitCode.FLOWN)
             problem = self._log.problem
             lost = f"{problem}: {self._log.lost} entries lost"

@@ -49,7 +49,7 @@ class Flights:
         self.engagements = 0
         self._prepared = source.newest
         self._known: IdentifiedVehicle | None = None  # with which the present flight began
-        self.current = self._companion(None)
+        self.current = self._new_flight(None)
 
     # ------------------------------------------------------------------ in place of a flight
 
@@ -106,11 +106,11 @@ class Flights:
     def _follow(self, prepared: Prepared) -> None:
         """Replace the present flight, which has ended or waits, by a new one."""
         self._prepared, self._known = prepared, self._remembered(prepared)
-        self.current = self._companion(self.current)
+        self.current = self._new_flight(self.current)
 
-    def _companion(self, before: Flight | None) -> Flight:
+    def _new_flight(self, before: Flight | None) -> Flight:
         self._prepared.controller.reset()
-        return self._prepared.companion(
+        return self._prepared.flight(
             self._session,
             self._stopwatch,
             known=self._known,

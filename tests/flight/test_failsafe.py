@@ -80,8 +80,8 @@ def test_missing_mode_report_is_named_first() -> None:
     """Without a report of the mode no other row has an effect."""
     flight = uneventful()
     assert flight.authority is not None
-    flight.authority.heard_s = -np.inf
-    flight.heard_s, flight.missed = -10.0, 10
+    flight.authority.report_s = -np.inf
+    flight.telemetry_host_s, flight.missed_decisions = -10.0, 10
     judge(flight)
     assert (flight.failsafe.action, flight.failsafe.row) == (LAND, "authority")
     assert flight.failsafe.reason.startswith("no report of the mode")
@@ -255,17 +255,17 @@ def unanswered(flight: FlightState, requests: int, delay_s: float = 0.01) -> Non
 
 # name of a row, function that sets its measured value, an allowed value, a value beyond the limit
 MEASURED: list[tuple[str, Measure, Any, Any]] = [
-    ("authority", lambda flight, age_s: setattr(flight.authority, "heard_s", NOW_S - age_s),
+    ("authority", lambda flight, age_s: setattr(flight.authority, "report_s", NOW_S - age_s),
      2.5, 2.6),
-    ("silence", holding(heard_s=float), -1.0, -1.1),
+    ("silence", holding(telemetry_host_s=float), -1.0, -1.1),
     ("blind", blind, 0.5, 0.51),
     ("age", aged, AGE_S, 0.26),
     ("link", clock(delay_growth_s=float), 0.3, 0.31),
     ("link", aged, AGE_S, 0.26),
     ("uplink", unanswered, 10, 11),
     ("uplink", partial(unanswered, delay_s=0.6), 10, 11),
-    ("decision", holding(missed=int, failure=lambda _: "it was late"), 0, 1),
-    ("decisions", holding(missed=int, failure=lambda _: "late"), 2, 3),
+    ("decision", holding(missed_decisions=int, failure=lambda _: "it was late"), 0, 1),
+    ("decisions", holding(missed_decisions=int, failure=lambda _: "late"), 2, 3),
     ("tilt", tilt, 1.29, 1.31),
     ("tilt error", tilt_from_commands, 0.49, 0.51),
     ("position error", near_reference, 4.99, 5.01),

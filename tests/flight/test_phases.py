@@ -89,7 +89,7 @@ def _fit(flight: FlightState) -> None:
 
 
 def _unhear_mode(flight: Any) -> None:
-    flight.authority.heard_s = -math.inf
+    flight.authority.report_s = -math.inf
 
 
 def _age_attitude(flight: FlightState) -> None:
@@ -196,13 +196,13 @@ EVENTS: dict[str, Setup] = {
     "authority_lost_armed": _stand(Standing.LOST, armed=True),
     "authority_lost_disarmed": _stand(Standing.LOST, armed=False),
     "mode_unknown": _unhear_mode,
-    "silent": _set(heard_s=-1.01),
+    "silent": _set(telemetry_host_s=-1.01),
     "in_own_failsafe": _stand(Standing.FAILSAFE),
     "unheard_on_ground": _unhear_mode,
-    "out_of_reach": _set(heard_s=-OUTAGE_MAX_S - 0.1),
-    "silent_on_ground": _set(heard_s=-20.1),
-    "silent_for_another": _all(_since(5.2), _set(heard_s=-5.1)),
-    "not_found": _set(heard_s=-20.1),
+    "out_of_reach": _set(telemetry_host_s=-OUTAGE_MAX_S - 0.1),
+    "silent_on_ground": _set(telemetry_host_s=-20.1),
+    "silent_for_another": _all(_since(5.2), _set(telemetry_host_s=-5.1)),
+    "not_found": _set(telemetry_host_s=-20.1),
     "blind": _age_attitude,
     "stop_requested": _stop,
     "stop_requested_on_ground": _all(_rest, _set(stop_reason="stop requested")),
@@ -297,7 +297,7 @@ def test_every_phase_has_a_time_limit() -> None:
         if phase is Phase.CLIMB:
             later = _climb_late  # counts from the end of the planned climb
         if phase is Phase.CONNECT:
-            later = _set(heard_s=-1e4)  # before telemetry, only the host's clock runs
+            later = _set(telemetry_host_s=-1e4)  # before telemetry, only the host's clock runs
         later(flight)
         assert next_row(flight) is not None
 
@@ -307,7 +307,7 @@ def test_waiting_phases_of_the_service_have_no_time_limit() -> None:
         for phase in (Phase.CONNECT, Phase.HEALTH, Phase.STANDBY, Phase.PAUSE):
             silent = phase in (Phase.CONNECT, Phase.HEALTH)
             flight = uneventful(phase, service)
-            flight.began_s, flight.heard_s = -1e6, -2e6 if silent else 0.0
+            flight.began_s, flight.telemetry_host_s = -1e6, -2e6 if silent else 0.0
             assert next_row(flight) is None
         # a vehicle that is heard again after a silence may be another one
         heard = uneventful(Phase.HEALTH, service)

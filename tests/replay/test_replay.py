@@ -86,8 +86,8 @@ def test_recorded_attitude_targets_are_not_a_second_sender(
     change_the_law(monkeypatch, 0.1)
     with unpacked("real-px4") as recording:
         replay = replayed(recording)
-    assert not any("another program" in said for said in replay.companion.announced)
-    assert replay.companion.phase is Phase.DISARMED
+    assert not any("another program" in said for said in replay.flight.announced)
+    assert replay.flight.phase is Phase.DISARMED
 
 
 # ------------------------------------------------------------------ what it says
@@ -221,7 +221,7 @@ def check(pair: Pair, tmp_path: Path, least: int) -> None:
     texts = {253} if pair.companion.snapshot().forged else set()
     sent = [frame[10 : 10 + frame[1]] for _, _, frame in pair.sent if frame[7] not in texts]
     assert [each.payload for each in replay.replayed if each.message_id not in texts] == sent
-    assert replay.companion.outcome == pair.companion.outcome
+    assert replay.flight.outcome == pair.companion.outcome
 
 
 def test_replay_reproduces_a_flight_with_duplicate_ids_and_a_pause(tmp_path: Path) -> None:
