@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Callable, Mapping
 from functools import cache
 
 import numpy as np
@@ -134,6 +135,7 @@ def name_failsafe(flight: FlightState) -> None:
 
 
 def _enter(flight: FlightState, row: Transition) -> None:
+    """End the present phase, and begin the target of `row`."""
     source, reason, cause = flight.phase, row.why(flight), row.cause.format(flight=flight)
     _conclude(flight, row, reason)
     flight.vehicle.clear_messages()
@@ -144,48 +146,12 @@ def _enter(flight: FlightState, row: Transition) -> None:
     flight.began_s = flight.now_s
     outbox.announce_phase(flight, reason, cause)
     if source in BEFORE_FLIGHT and row.target in FLYING:
-        flight.authority.ask()  # it may show the mode already
-        flight.clock.settle()
-        dialect = flight.dialect
-        assert dialect is not None
-        rates_hz = flight.session.telemetry.rates_hz
-        flight.positioning.begin(flight.vehicle, rates_hz, dialect.estimator_message)
-        if flight.identification:
-            flight.identification.on_link_delay(flight.clock.delay)
-            if limits := shown_limits(flight, flight.identification):
-                flight.model = flight.model.model_copy(update=limits)
-                flight.identification.on_shown(limits)
-        if source is Phase.ARM:  # on the ground, where the time that this takes does no harm
-            decision.begin(flight)
+        _begin_to_fly(flight, source)
     if flight.identification:
         stage = STAGES.get(row.target, Stage.OTHER)
         flight.identification.on_stage(stage, flight.time_s)
-    if row.target is Phase.ENGAGE:
-        # here and not with the request, because a vehicle that shows the mode already gets none
-        flight.authority.ask()
-        _set_hover_thrust(flight)
-    elif row.target is Phase.HEALTH:  # it may be another vehicle, or have other parameters
-        flight.vehicle.parameters.clear()
-        flight.reading = ParameterReading()
-    elif row.target is Phase.TAKEOFF:
-        position = flight.vehicle.position
-        assert position is not None
-        flight.home_ned_m, flight.took_off = flight.jumps.without(position.position_ned_m), True
-        if flight.takes_off_by_command:  # a level setpoint would cancel it
-            flight.setpoint_s = math.inf
-    elif row.target is Phase.CLIMB:
-        _begin_climb(flight, source)
-    elif row.target is Phase.JOIN:
-        # the greatest: before a later start the vehicle may have come to stand on something
-        shown = flight.observer.hover_thrust_estimate
-        flight.start_hover_thrust = float(np.fmax(shown, flight.start_hover_thrust))
-        flight.plan.start_track(flight.time_s)
-    elif row.target is Phase.PAUSE:
-        flight.plan.pause(flight.time_s)
-    elif source is Phase.PAUSE and row.target is Phase.TRACK:
-        flight.plan.resume(flight.time_s)
-    elif row.target is Phase.LAND:
-        flight.touchdown = Touchdown(flight.home_ned_m if flight.took_off else None)
+    if row.target in BEGINS:
+        BEGINS[row.target](flight, source)
 
 
 def _conclude(flight: FlightState, row: Transition, reason: str) -> None:
@@ -209,6 +175,63 @@ def _explanation(flight: FlightState) -> str:
         return vehicle.explanation("")
     fix = dialect.remedy(vehicle.texts)
     return vehicle.explanation(dialect.unsaid) + (fix and f". Fix: {fix}")
+
+
+def _begin_to_fly(flight: FlightState, source: Phase) -> None:
+    """Note what is known about vehicle and link when the first phase in flight begins."""
+    flight.authority.ask()  # it may show the mode already
+    flight.clock.settle()
+    dialect = flight.dialect
+    assert dialect is not None
+    rates_hz = flight.session.telemetry.rates_hz
+    flight.positioning.begin(flight.vehicle, rates_hz, dialect.estimator_message)
+    if flight.identification:
+        flight.identification.on_link_delay(flight.clock.delay)
+        if limits := shown_limits(flight, flight.identification):
+            flight.model = flight.model.model_copy(update=limits)
+            flight.identification.on_shown(limits)
+    if source is Phase.ARM:  # on the ground, where the time that this takes does no harm
+        decision.begin(flight)
+
+
+def _begin_health(flight: FlightState, source: Phase) -> None:
+    """Forget the parameters: it may be another vehicle, or have other parameters."""
+    flight.vehicle.parameters.clear()
+    flight.reading = ParameterReading()
+
+
+def _begin_engage(flight: FlightState, source: Phase) -> None:
+    # here and not with the request, because a vehicle that shows the mode already gets none
+    flight.authority.ask()
+    _set_hover_thrust(flight)
+
+
+def _begin_takeoff(flight: FlightState, source: Phase) -> None:
+    position = flight.vehicle.position
+    assert position is not None
+    flight.home_ned_m, flight.took_off = flight.jumps.without(position.position_ned_m), True
+    if flight.takes_off_by_command:  # a level setpoint would cancel it
+        flight.setpoint_s = math.inf
+
+
+def _begin_join(flight: FlightState, source: Phase) -> None:
+    # the greatest: before a later start the vehicle may have come to stand on something
+    shown = flight.observer.hover_thrust_estimate
+    flight.start_hover_thrust = float(np.fmax(shown, flight.start_hover_thrust))
+    flight.plan.start_track(flight.time_s)
+
+
+def _begin_pause(flight: FlightState, source: Phase) -> None:
+    flight.plan.pause(flight.time_s)
+
+
+def _begin_track(flight: FlightState, source: Phase) -> None:
+    if source is Phase.PAUSE:
+        flight.plan.resume(flight.time_s)
+
+
+def _begin_land(flight: FlightState, source: Phase) -> None:
+    flight.touchdown = Touchdown(flight.home_ned_m if flight.took_off else None)
 
 
 def _begin_climb(flight: FlightState, source: Phase) -> None:
@@ -238,6 +261,19 @@ def _begin_climb(flight: FlightState, source: Phase) -> None:
         np.array(position.velocity_ned_mps),
         flight.vehicle.heading_rad,
     )
+
+
+BEGINS: Mapping[Phase, Callable[[FlightState, Phase], None]] = {
+    Phase.HEALTH: _begin_health,
+    Phase.ENGAGE: _begin_engage,
+    Phase.TAKEOFF: _begin_takeoff,
+    Phase.CLIMB: _begin_climb,
+    Phase.JOIN: _begin_join,
+    Phase.PAUSE: _begin_pause,
+    Phase.TRACK: _begin_track,
+    Phase.LAND: _begin_land,
+}
+"""What begins with a phase: a function of the flight and of the phase before."""
 
 
 def _place_reference(flight: FlightState, position: LocalPosition) -> None:
