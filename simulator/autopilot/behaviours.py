@@ -166,21 +166,24 @@ class FlyMission(ActiveBehaviour):
 
 
 class FlyBySticks(ActiveBehaviour):
-    """ArduCopter LOITER, ALT_HOLD and POSHOLD; PX4 POSCTL and ALTCTL, in which the vehicle descends
-    slowly, because PX4's stick input is not simulated."""
+    """ArduCopter LOITER, ALT_HOLD and POSHOLD; PX4 POSCTL and ALTCTL. Without stick input the
+    vehicle descends slowly."""
 
     lifts_off = True
 
+    @property
+    def automatic(self) -> bool:
+        return False
+
     def enter(self, estimate: StateEstimate, place_ned_m: Triple, *, landed: bool) -> None:
-        if self.guidance.sticks is not None:
-            self.guidance.sticks.begin()
+        self.guidance.sticks.begin()
 
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
         """Return the motion that the sticks demand; horizontally and vertically the place is held
         if there is no demand."""
         guidance = self.guidance
         descend = descent(guidance.hold_ned_m, guidance.parameters.role("stick_descent_mps"))
-        if guidance.sticks is None:
+        if not guidance.sticks.present(estimate.time_s):
             return descend
         demand = guidance.sticks.demand(estimate.time_s, estimate.yaw_rad)
         velocity, acceleration, climb_mps, turn_radps = demand
@@ -225,7 +228,7 @@ BEHAVIOURS: Mapping[Behaviour, type[ActiveBehaviour]] = {
     Behaviour.LAND: Land,
     Behaviour.RETURN: Return,
     Behaviour.MISSION: FlyMission,
-    Behaviour.DESCEND: FlyBySticks,
+    Behaviour.STICKS: FlyBySticks,
     # the position controller flies these itself and does not call `motion`
     Behaviour.LEVEL: ActiveBehaviour,
     Behaviour.COAST: ActiveBehaviour,

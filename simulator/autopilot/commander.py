@@ -250,6 +250,8 @@ CONDITIONS: dict[str, Callable[[Commander], bool]] = {
     "requested by ground station": lambda c: c._request.by_ground_station,
     "mode needs position": lambda c: c.mode.needs_position,
     "mode arms": lambda c: c.mode.arms,
+    "mode needs sticks": lambda c: c.mode.needs_sticks,
+    "throttle raised": lambda c: c._guidance.sticks.throttle_raised(c._state.time_s),
     "position missing": lambda c: (
         c._requested.needs_position
         and ("position" not in c._health.reached or c._health.position_lost)

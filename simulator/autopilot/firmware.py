@@ -196,7 +196,9 @@ class Firmware(ABC):
     # the position loop integrates on the ground during the takeoff ramp; False: only after it
     integrates_on_ramp: bool = False
     place_below_is_descent: bool = False  # land detector: a place below is a demand to descend
-    flown_by_sticks: bool = False  # stick input is simulated
+    # pulse widths of the RC channels that no client overrides: roll, pitch, throttle, yaw, mode
+    # switch and others; 0: no input
+    default_sticks_us: tuple[int, ...] = (0,) * 8
 
     def mode_named(self, name: str) -> Mode | None:
         """Return the mode of this name, in which "AUTO." may be left out, or None."""
@@ -245,6 +247,10 @@ class Firmware(ABC):
         """Whether a heartbeat with this MAV_TYPE and system id comes from a ground station."""
         name = self.ground_station_parameter
         return system == parameters[name] if name else kind == _MAV_TYPE_GCS
+
+    @abstractmethod
+    def takes_sticks_from(self, sender: int, parameters: ParameterValues) -> bool:
+        """Whether stick input from the system id `sender` is used."""
 
     def obeys_system(self, sender: int, own: int, parameters: ParameterValues) -> bool:
         """Whether messages from the system id `sender` are handled."""

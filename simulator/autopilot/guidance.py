@@ -77,8 +77,7 @@ class ActiveBehaviour:
 class Guidance:
     """Carries out one behaviour at a time.
 
-    `sticks` is None for a firmware whose stick input is not simulated (PX4). The autopilot gives
-    `events` to the commander at each step.
+    The autopilot gives `events` to the commander at each step.
     """
 
     def __init__(
@@ -90,7 +89,7 @@ class Guidance:
     ) -> None:
         self.firmware, self.parameters, self.mission = firmware, parameters, mission
         self.events = mission.events
-        self.sticks = Sticks() if firmware.flown_by_sticks else None
+        self.sticks = Sticks(parameters.role, firmware.default_sticks_us)
         self.newest: Setpoint | None = None  # setpoint of a client
         self.newest_s = -math.inf  # time since boot of the newest accepted setpoint message
         self.hold = MotionSetpoint(ORIGIN)

@@ -32,6 +32,7 @@ class Health:
         self._ahead = sorted((at_s * boot_scale, event) for event, at_s in times_s)
         self.ground_station_lost = False
         self.position_lost = False  # for lack of a GPS fix
+        self.sticks_lost = not guidance.sticks.present(0.0)
         self._heartbeat_s = math.nan  # time of the last one from a ground station
         self._battery_level = 0  # last level that was reported (`Firmware.battery_level`)
         self._worse_s = math.nan  # time since which the level is greater than that
@@ -56,6 +57,7 @@ class Health:
             self._fix_s = now_s
         yield from self._ground_station(now_s)
         yield from self._battery(now_s, armed, battery)
+        yield from self._sticks(now_s)
         lost = self.without_fix_s(now_s) > self._parameters.role("position_without_fix_s")
         if lost != self.position_lost:
             self.position_lost = lost
@@ -69,6 +71,13 @@ class Health:
         if lost != self.ground_station_lost:
             self.ground_station_lost = lost
             yield "ground station lost" if lost else "ground station found"
+
+    def _sticks(self, now_s: float) -> Iterator[str]:
+        """Event of lost or found stick input."""
+        lost = not self._guidance.sticks.present(now_s)
+        if lost != self.sticks_lost:
+            self.sticks_lost = lost
+            yield "sticks lost" if lost else "sticks found"
 
     def _battery(self, now_s: float, armed: bool, battery: BatteryState) -> Iterator[str]:
         """Event of a battery level, when it has lasted. While the vehicle is armed, only a level
@@ -138,6 +147,8 @@ class Health:
         heard = not (self.ground_station_lost or math.isnan(self._heartbeat_s))
         if self._parameters.role("ground_station_needed") > 0 and not heard:
             return False
+        if mode.needs_sticks and not (self._flies_by_sticks(mode) or armed):
+            return False
         if mode.behaviour is Behaviour.MISSION:
             return self._guidance.mission.flyable
         needs_stream = mode.behaviour is Behaviour.SETPOINT and firmware.setpoint_mode_needs_stream
@@ -149,4 +160,9 @@ class Health:
             return self._guidance.stream_alive(now_s)
         if mode.behaviour is Behaviour.MISSION:
             return self._guidance.mission.flyable
-        return not mode.needs_sticks
+        return not mode.needs_sticks or self._flies_by_sticks(mode)
+
+    def _flies_by_sticks(self, mode: Mode) -> bool:
+        """Whether a mode that needs sticks has them; the modes without position control are not
+        simulated."""
+        return mode.behaviour is Behaviour.STICKS and not self.sticks_lost

@@ -1,52 +1,70 @@
-"""Stick input of ArduCopter: default RC channels, and channels that a client overrides.
-
-It converts pulse widths to demanded velocities and rates. Knows no modes and no vehicle.
+"""Stick input: RC channels that a client overrides (RC_CHANNELS_OVERRIDE, MANUAL_CONTROL), and the
+default ones of ArduCopter's SITL. It converts pulse widths to demanded velocities and rates. Knows
+no modes and no vehicle.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 KEEP, RELEASE = 65535, 0  # RC_CHANNELS_OVERRIDE: do not change this channel, end its override
-OVERRIDE_S = 3.0  # RC_OVERRIDE_TIME
-_CENTRE_US, _RANGE_US = 1500, 500
+CENTRE_US = 1500
+_RANGE_US = 500
+_STICKS = 4  # the first channels: roll, pitch, throttle, yaw
 _PERIOD_MIN_S, _PERIOD_MAX_S = 1e-3, 0.1  # limits of the time between two `demand`s
-_THROTTLE_DEAD_ZONE_US = 100  # THR_DZ
-# Channels of SITL without RC: roll, pitch, throttle (down), yaw, mode switch (5) and others
-_DEFAULT_US = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
-_CLIMB_MPS = 2.5  # PILOT_SPEED_UP, also of the descent with the throttle down
-_TURN_RADPS = math.radians(202.5)  # PILOT_Y_RATE
-_SPEED_MPS = 12.5  # LOIT_SPEED
-_ACCELERATION_MPS2 = 3.57  # g times tangent of two thirds of ANGLE_MAX
-_BRAKING_MPS2, _BRAKING_AFTER_S = 2.5, 1.0  # with centred sticks: LOIT_BRK_ACCEL, LOIT_BRK_DELAY
+# PX4: low-pass of the speed of a stick, and the speed above which it counts as moved, in halves of
+# its range per second (COM_RC_STICK_OV)
+_SPEED_FILTER_S, _MOVED_PS = 0.1, 0.3
 Pair = tuple[float, float]
 
 
 class Sticks:
-    """RC channels of one vehicle; times are seconds since boot."""
+    """RC channels of one vehicle; times are seconds since boot.
 
-    def __init__(self) -> None:
-        self._overridden: dict[int, tuple[int, float]] = {}  # channel -> pulse width, end time
+    `role` returns values of the firmware (`Firmware.parameter_roles`). `default_us` are the pulse
+    widths of channels that no client overrides; 0 is a channel without input.
+    """
+
+    def __init__(self, role: Callable[[str], float], default_us: Sequence[int]) -> None:
+        self._role, self._default_us = role, default_us
+        self._overridden: dict[int, tuple[int, float]] = {}  # channel -> pulse width, its time
+        self._speeds_ps = [0.0] * _STICKS  # filtered speeds of the sticks
         self._velocity_mps = (0.0, 0.0)  # demanded: north, east
         self._called_s = self._deflected_s = math.nan  # last `demand`, and last with a deflection
 
-    def override(self, pulses_us: Sequence[int], now_s: float) -> None:
-        """Apply RC_CHANNELS_OVERRIDE; `pulses_us` begins with the first channel."""
-        for channel, pulse_us in enumerate(pulses_us[: len(_DEFAULT_US)]):
+    def override(self, pulses_us: Sequence[int], now_s: float) -> bool:
+        """Apply the pulse widths of a message, which begin with the first channel. Returns whether
+        a stick is moving."""
+        for channel, pulse_us in enumerate(pulses_us[: len(self._default_us)]):
             if pulse_us == RELEASE:
                 self._overridden.pop(channel, None)
             elif pulse_us != KEEP:
-                self._overridden[channel] = (pulse_us, now_s + OVERRIDE_S)
+                if channel < _STICKS:
+                    before_us, before_s = self._overridden.get(channel, (pulse_us, -math.inf))
+                    passed_s = max(_PERIOD_MIN_S, now_s - before_s)
+                    speed_ps = (pulse_us - before_us) / _RANGE_US / passed_s
+                    share = passed_s / (passed_s + _SPEED_FILTER_S) if passed_s < 1.0 else 1.0
+                    self._speeds_ps[channel] += share * (speed_ps - self._speeds_ps[channel])
+                self._overridden[channel] = (pulse_us, now_s)
+        return any(abs(speed_ps) > _MOVED_PS for speed_ps in self._speeds_ps)
 
     def pulses_us(self, now_s: float) -> tuple[int, ...]:
         """Return the pulse widths of all channels."""
-        return tuple(
-            self._overridden[channel][0]
-            if now_s < self._overridden.get(channel, (0, -math.inf))[1]
-            else default_us
-            for channel, default_us in enumerate(_DEFAULT_US)
-        )
+        since_s = now_s - self._role("stick_timeout_s")
+        widths = list(self._default_us)
+        for channel, (pulse_us, at_s) in self._overridden.items():
+            if at_s > since_s:
+                widths[channel] = pulse_us
+        return tuple(widths)
+
+    def present(self, now_s: float) -> bool:
+        """Whether all sticks have input."""
+        return all(self.pulses_us(now_s)[:_STICKS])
+
+    def throttle_raised(self, now_s: float) -> bool:
+        """Whether the throttle is more than a fifth above its centre."""
+        return self.pulses_us(now_s)[2] > CENTRE_US + 0.2 * _RANGE_US
 
     def begin(self) -> None:
         """Begin a mode flown by sticks, with zero demanded velocity."""
@@ -55,10 +73,12 @@ class Sticks:
     def demand(self, now_s: float, yaw_rad: float) -> tuple[Pair, Pair, float, float]:
         """Return demanded velocity and acceleration (north, east), climb rate and yaw rate; SI.
 
-        The stick deflection accelerates the velocity against a drag, which limits it to LOIT_SPEED.
+        The stick deflection accelerates the velocity against a drag, which limits its speed.
         """
-        roll, pitch, throttle, yaw = self.pulses_us(now_s)[:4]
-        forward, right = -_deflection(pitch), _deflection(roll)
+        role = self._role
+        roll, pitch, throttle, yaw = self.pulses_us(now_s)[:_STICKS]
+        dead_us = role("stick_dead_zone_us")
+        forward, right = -self._deflection(pitch, dead_us), self._deflection(roll, dead_us)
         duration_s = min(_PERIOD_MAX_S, max(0.0, now_s - self._called_s))
         self._called_s = now_s
         if forward or right:
@@ -68,24 +88,29 @@ class Sticks:
         self._accelerate((cos * forward - sin * right, sin * forward + cos * right), duration_s)
         changes = zip(self._velocity_mps, before, strict=True)
         north, east = ((after - first) / max(duration_s, _PERIOD_MIN_S) for after, first in changes)
-        climb_mps = _CLIMB_MPS * _deflection(throttle, _THROTTLE_DEAD_ZONE_US)
-        return self._velocity_mps, (north, east), climb_mps, _TURN_RADPS * _deflection(yaw)
+        climb = self._deflection(throttle, role("throttle_dead_zone_us"))
+        climb_mps = climb * role("stick_climb_mps" if climb > 0.0 else "stick_sink_mps")
+        turn_radps = role("stick_turn_radps") * self._deflection(yaw, dead_us)
+        return self._velocity_mps, (north, east), climb_mps, turn_radps
 
     def _accelerate(self, deflection: Pair, duration_s: float) -> None:
-        drag_ps = _ACCELERATION_MPS2 / _SPEED_MPS
+        role = self._role
+        acceleration_mps2 = role("stick_acceleration_mps2")
+        drag_ps = acceleration_mps2 / max(role("stick_speed_mps"), 1e-3)
         north, east = (
-            speed + duration_s * (_ACCELERATION_MPS2 * share - drag_ps * speed)
+            speed + duration_s * (acceleration_mps2 * share - drag_ps * speed)
             for speed, share in zip(self._velocity_mps, deflection, strict=True)
         )
         speed = math.hypot(north, east)
-        if speed > 0.0 and self._called_s - self._deflected_s > _BRAKING_AFTER_S:
-            factor = max(0.0, speed - _BRAKING_MPS2 * duration_s) / speed
+        if speed > 0.0 and self._called_s - self._deflected_s > role("stick_brakes_after_s"):
+            factor = max(0.0, speed - role("stick_braking_mps2") * duration_s) / speed
             north, east = factor * north, factor * east
         self._velocity_mps = (north, east)
 
-
-def _deflection(pulse_us: int, dead_zone_us: int = 20) -> float:
-    """Stick deflection, -1 .. 1, with a dead zone (RCx_DZ)."""
-    offset_us = min(_RANGE_US, max(-_RANGE_US, pulse_us - _CENTRE_US))
-    share = max(0, abs(offset_us) - dead_zone_us) / (_RANGE_US - dead_zone_us)
-    return math.copysign(share, offset_us)
+    def _deflection(self, pulse_us: int, dead_zone_us: float) -> float:
+        """Stick deflection, -1 .. 1, with a dead zone (RCx_DZ, MPC_HOLD_DZ), smaller near the
+        centre (MPC_XY_MAN_EXPO)."""
+        offset_us = min(_RANGE_US, max(-_RANGE_US, pulse_us - CENTRE_US))
+        share = max(0.0, abs(offset_us) - dead_zone_us) / max(1.0, _RANGE_US - dead_zone_us)
+        bend = self._role("stick_expo")
+        return math.copysign((1.0 - bend) * share + bend * share**3, offset_us)

@@ -94,7 +94,7 @@ class Behaviour(Enum):
     LAND = "descends where it is and lands"
     RETURN = "flies home and lands"
     MISSION = "flies the mission"
-    DESCEND = "descends slowly: a manual mode without stick input"
+    STICKS = "flies by sticks; descends slowly without stick input"
     LEVEL = "level attitude, least throttle: a manual mode with sticks down"
     COAST = "keeps the last demand: a manual mode without stick input"
     SETPOINT = "obeys setpoints"

@@ -162,7 +162,7 @@ class PilotTakesOver(Timed):
     """The pilot switches to a mode, and after `for_s` back to the mode before.
 
     ArduCopter has the stick input of SITL without RC, throttle down, until a client overrides it.
-    PX4 has no stick input, so that in POSCTL the vehicle descends slowly.
+    Without MANUAL_CONTROL, PX4 descends slowly in POSCTL.
     """
 
     fault: Literal["pilot_takes_over"]

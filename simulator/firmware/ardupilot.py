@@ -195,6 +195,10 @@ class ArduCopter(Firmware):
             return _UNSUPPORTED_FRAME, None
         return None
 
+    def takes_sticks_from(self, sender: int, parameters: ParameterValues) -> bool:
+        """Only those of the ground station are used."""
+        return sender == parameters["SYSID_MYGCS"]
+
     def obeys_system(self, sender: int, own: int, parameters: ParameterValues) -> bool:
         """Every system; with SYSID_ENFORCE only the ground station and the vehicle itself."""
         return not parameters["SYSID_ENFORCE"] or sender in (own, parameters["SYSID_MYGCS"])
@@ -305,5 +309,5 @@ ARDUPILOT = ArduCopter(
     sensor_bits=(0x5371FC2F, 0x5361FC2F, 0x4771FC2F),
     battery_events=("battery low", "battery critical"),
     place_below_is_descent=True,
-    flown_by_sticks=True,
+    default_sticks_us=(1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800),  # of SITL without RC
 )

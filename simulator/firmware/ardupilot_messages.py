@@ -85,9 +85,8 @@ def ekf_status_report(view: View) -> Sequence[Any]:
 
 def rc_channels(view: View) -> Sequence[Any]:
     """The channels of SITL without RC, or those of RC_CHANNELS_OVERRIDE."""
-    sticks = view.autopilot.guidance.sticks
-    assert sticks is not None
-    widths_us = sticks.pulses_us(view.autopilot.state.time_s)
+    autopilot = view.autopilot
+    widths_us = autopilot.guidance.sticks.pulses_us(autopilot.state.time_s)
     return (view.time_ms, len(widths_us), *widths_us, *(0,) * (18 - len(widths_us)), 255)
 
 

@@ -29,19 +29,19 @@ MODES = {
     for mode in (
         Mode("STABILIZE", "STABILIZE", 0, BY_HAND, Behaviour.LEVEL),
         Mode("ACRO", "ACRO", 1, BY_HAND, Behaviour.LEVEL),
-        Mode("ALT_HOLD", "ALT_HOLD", 2, BY_HAND, Behaviour.DESCEND),
+        Mode("ALT_HOLD", "ALT_HOLD", 2, BY_HAND, Behaviour.STICKS),
         _by_position("AUTO", 3, Behaviour.MISSION, arms=False),
         _by_position("GUIDED", 4, Behaviour.SETPOINT),
-        _by_position("LOITER", 5, Behaviour.DESCEND),
+        _by_position("LOITER", 5, Behaviour.STICKS),
         _by_position("RTL", 6, Behaviour.RETURN, arms=False),
         _by_position("CIRCLE", 7, Behaviour.HOLD, arms=False),
         Mode("LAND", "LAND", 9, BY_POSITION, Behaviour.LAND, arms=False),
-        Mode("DRIFT", "DRIFT", 11, BY_HAND, Behaviour.DESCEND, needs_position=True),
-        _by_position("POSHOLD", 16, Behaviour.DESCEND),
+        Mode("DRIFT", "DRIFT", 11, BY_HAND, Behaviour.STICKS, needs_position=True),
+        _by_position("POSHOLD", 16, Behaviour.STICKS),
         _by_position("BRAKE", 17, Behaviour.HOLD, arms=False),
         _by_position("THROW", 18, Behaviour.LEVEL),
         _by_position("AVOID_ADSB", 19, Behaviour.HOLD, arms=False),
-        _by_position("ZIGZAG", 24, Behaviour.DESCEND),
+        _by_position("ZIGZAG", 24, Behaviour.STICKS),
         Mode("GUIDED_NOGPS", "GUIDED_NOGPS", 20, BY_HAND, Behaviour.SETPOINT),
         replace(_by_position("SMART_RTL", 21, Behaviour.RETURN, arms=False), title="SMARTRTL"),
     )
@@ -106,13 +106,13 @@ PARAMETERS = (
     _int16("LAND_SPEED", 50),  # cm/s near the ground
     _int16("LAND_SPEED_HIGH", 0),  # cm/s higher up, 0 WPNAV_SPEED_DN
     _int32("LOG_BITMASK", 180222),  # without effect: there is no log
-    _real("LOIT_SPEED", 1250.0),  # cm/s of stick flight; without effect
+    _real("LOIT_SPEED", 1250.0),  # cm/s of stick flight
     _int8("MIS_RESTART", 0),  # AUTO: 0 resumes the mission, 1 restarts it
     _int16("MIS_TOTAL", 0),  # items of the mission
     _int8("MOT_HOVER_LEARN", 2),  # learn the hover thrust: 1 until reboot, 2 saved
     _real("MOT_THST_EXPO", 0.65),  # curvature of thrust over throttle, 0 linear
     _real("MOT_THST_HOVER", 0.39),  # hover thrust, normalised
-    _int16("PILOT_SPEED_UP", 250),  # cm/s of stick flight; without effect
+    _int16("PILOT_SPEED_UP", 250),  # cm/s of stick flight
     _real("PSC_JERK_XY", 5.0),  # m/s^3 across the ground; without effect
     _real("PSC_POSXY_P", 1.0),  # 1/s
     _real("PSC_POSZ_P", 1.0),  # 1/s
@@ -204,6 +204,17 @@ ROLES: dict[str, Role] = {
     "still_across_mps": math.inf,
     "still_radps": math.inf,
     "stick_descent_mps": 2.4,
+    "stick_timeout_s": 3.0,  # RC_OVERRIDE_TIME
+    "stick_dead_zone_us": 20.0,  # RCx_DZ
+    "throttle_dead_zone_us": 100.0,  # THR_DZ
+    "stick_expo": 0.0,
+    "stick_climb_mps": ("PILOT_SPEED_UP", _CENTI),
+    "stick_sink_mps": ("PILOT_SPEED_UP", _CENTI),
+    "stick_turn_radps": math.radians(202.5),  # PILOT_Y_RATE
+    "stick_speed_mps": ("LOIT_SPEED", _CENTI),
+    "stick_acceleration_mps2": 3.57,  # g times tangent of two thirds of ANGLE_MAX
+    "stick_braking_mps2": 2.5,  # LOIT_BRK_ACCEL
+    "stick_brakes_after_s": 1.0,  # LOIT_BRK_DELAY
     "setpoint_spool_s": 2.8,
     "stream_reaction_s": 0.0,
     "ground_station_stays_s": 0.0,

@@ -193,6 +193,10 @@ class Px4(Firmware):
             return _UNSUPPORTED_FRAME, _INVALID
         return None
 
+    def takes_sticks_from(self, sender: int, parameters: ParameterValues) -> bool:
+        """Those of every system, unless the parameter allows RC or nothing."""
+        return parameters["COM_RC_IN_MODE"] in (1, 2, 3)
+
     def battery_level(self, battery: BatteryState, parameters: ParameterValues) -> int:
         """Return the number of thresholds that the remaining share is below."""
         return sum(battery.remaining < parameters[name] for name in _BATTERY_THRESHOLDS)
@@ -257,6 +261,7 @@ PX4 = Px4(
     never_sent=telemetry.NEVER_SENT,
     interval_refusal=Result.FAILED,
     request_refusal=Result.DENIED,
+    ignored=frozenset({"RC_CHANNELS_OVERRIDE"}),  # RC channels without RC_MAP_*
     target_component_checked=True,
     never_to_all=frozenset({"COMMAND", "MISSION", "PARAM"}),
     text_suffix="\t",

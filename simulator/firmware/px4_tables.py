@@ -25,7 +25,7 @@ AUTO, OFFBOARD, RATES, MANUAL = 29, 17, 1, 81
 
 
 def _by_sticks(name: str, title: str, number: int, behaviour: Behaviour) -> Mode:
-    return Mode(name, title, number, MANUAL, behaviour, arms=False, needs_sticks=True)
+    return Mode(name, title, number, MANUAL, behaviour, needs_sticks=True)
 
 
 def _ends(name: str, title: str, number: int, behaviour: Behaviour) -> Mode:
@@ -45,8 +45,8 @@ MODES = {
         _ends("AUTO.PRECLAND", "Precision Land", 0x09040000, Behaviour.LAND),
         Mode("TERMINATION", "Termination", 0x000A0000, RATES, Behaviour.HOLD, arms=False),
         Mode("OFFBOARD", "Offboard", 0x00060000, OFFBOARD, Behaviour.SETPOINT),
-        _by_sticks("POSCTL", "Position", 0x00030000, Behaviour.DESCEND),
-        _by_sticks("ALTCTL", "Altitude", 0x00020000, Behaviour.DESCEND),
+        _by_sticks("POSCTL", "Position", 0x00030000, Behaviour.STICKS),
+        _by_sticks("ALTCTL", "Altitude", 0x00020000, Behaviour.STICKS),
         _by_sticks("STABILIZED", "Stabilized", 0x00070000, Behaviour.COAST),
         _by_sticks("MANUAL", "Manual", 0x00010000, Behaviour.COAST),
         _by_sticks("ACRO", "Acro", 0x00050000, Behaviour.COAST),
@@ -79,9 +79,11 @@ PARAMETERS = (
     _int("COM_LOW_BAT_ACT", 3, 0, 3),  # battery: 0 warning, 1 return, 2 land, 3 return or land
     _int("COM_OBL_RC_ACT", 0, 0, 5),  # offboard lost: POSCTL ALTCTL STABILIZED RTL LAND LOITER
     _real("COM_OF_LOSS_T", 1.0, 0, 60),  # s without setpoint until offboard is lost
-    _int("COM_RCL_EXCEPT", 0, 0, 31),  # modes without failsafe when sticks are lost, bit 2 offboard
+    # modes without failsafe when sticks are lost, bits: 0 mission, 1 hold and takeoff, 2 offboard
+    _int("COM_RCL_EXCEPT", 0, 0, 31),
     _int("COM_RC_IN_MODE", 1, 0, 4),  # manual input: 0 RC, 1 joystick, 4 none
-    _real("COM_RC_LOSS_T", 0.5, 0, 35),  # s without sticks until they are lost; without effect
+    _real("COM_RC_LOSS_T", 0.5, 0, 35),  # s without sticks until they are lost
+    _int("COM_RC_OVERRIDE", 1, 0, 3),  # moved sticks end bit 0 automatic modes, bit 1 offboard
     _real("COM_SPOOLUP_TIME", 1.0, 0, 30),  # s from arming until takeoff may begin
     _int("COM_TAKEOFF_ACT", 0, 0, 1),  # after takeoff: 0 hold
     _int("EKF2_NOAID_TOUT", 5000000, 500000, 10000000),  # us without aiding until position is lost
@@ -97,13 +99,15 @@ PARAMETERS = (
     _real("MIS_TAKEOFF_ALT", 2.5, 0, 80),  # m, takeoff height
     _int("MIS_TKO_LAND_REQ", 0, 0, 4),  # what a mission must have
     _real("MPC_ACC_DOWN_MAX", 3.0, 2, 15),  # m/s^2, downwards in automatic flight
-    _real("MPC_ACC_HOR", 3.0, 2, 15),  # m/s^2, horizontal in automatic flight
+    _real("MPC_ACC_HOR", 3.0, 2, 15),  # m/s^2, horizontal
+    _real("MPC_HOLD_DZ", 0.1, 0, 1),  # dead zone of the sticks
     _real("MPC_LAND_ALT1", 10.0, 0, 122),  # m below which a descent slows down
     _real("MPC_LAND_ALT2", 5.0, 0, 122),  # m below which the speed is MPC_LAND_SPEED
     _real("MPC_LAND_ALT3", 1.0, 0, 122),  # m above ground, below which MPC_LAND_CRWL applies
     _real("MPC_LAND_CRWL", 0.3, 0.1, 10),  # m/s of descent just above the ground
     _real("MPC_LAND_SPEED", 0.7, 0.6, 10),  # m/s near the ground
     _real("MPC_MANTHR_MIN", 0.08, 0, 1),  # least thrust of stick flight
+    _real("MPC_MAN_Y_MAX", 150.0, 0, 400),  # deg/s of turns by stick
     _real("MPC_THR_HOVER", 0.5, 0.1, 0.8),  # hover thrust, normalised
     _real("MPC_THR_MAX", 1.0, 0, 1),  # most thrust of the position loop
     _real("MPC_THR_MIN", 0.12, 0.05, 0.5),  # least thrust of the position loop
@@ -111,7 +115,9 @@ PARAMETERS = (
     _real("MPC_TKO_RAMP_T", 3.0, 0, 5),  # s until the climb rate of a takeoff is reached
     _real("MPC_TKO_SPEED", 1.5, 1, 5),  # m/s of climb at takeoff
     _int("MPC_USE_HTE", 1, 0, 1),  # estimate the hover thrust
+    _real("MPC_VEL_MANUAL", 10.0, 3, 20),  # m/s of stick flight
     _real("MPC_XY_CRUISE", 5.0, 3, 20),  # m/s, horizontal in automatic flight
+    _real("MPC_XY_MAN_EXPO", 0.6, 0, 1),  # share of the cube of a stick's deflection
     _real("MPC_XY_P", 0.95, 0, 2),  # 1/s
     _real("MPC_XY_VEL_D_ACC", 0.2, 0.1, 2),  # -
     _real("MPC_XY_VEL_I_ACC", 0.4, 0, 60),  # 1/s^2
@@ -213,6 +219,17 @@ ROLES: dict[str, Role] = {
     "still_across_mps": 1.5,  # LNDMC_XY_VEL_MAX
     "still_radps": math.radians(20.0),  # LNDMC_ROT_MAX
     "stick_descent_mps": 0.6,  # in a manual mode without stick input
+    "stick_timeout_s": "COM_RC_LOSS_T",
+    "stick_dead_zone_us": ("MPC_HOLD_DZ", 500.0),
+    "throttle_dead_zone_us": ("MPC_HOLD_DZ", 500.0),
+    "stick_expo": "MPC_XY_MAN_EXPO",
+    "stick_climb_mps": "MPC_Z_VEL_MAX_UP",
+    "stick_sink_mps": "MPC_Z_VEL_MAX_DN",
+    "stick_turn_radps": ("MPC_MAN_Y_MAX", math.radians(1.0)),
+    "stick_speed_mps": "MPC_VEL_MANUAL",
+    "stick_acceleration_mps2": "MPC_ACC_HOR",
+    "stick_braking_mps2": "MPC_ACC_HOR",
+    "stick_brakes_after_s": 0.3,  # with centred sticks
     "setpoint_spool_s": 0.0,  # from arming until the thrust of an attitude setpoint is applied
     "stream_reaction_s": 0.036,  # from the timeout of the setpoints until they count as lost
     # time for which a ground station counts as connected after a HEARTBEAT; the timeout follows
@@ -224,10 +241,13 @@ _LATER = Result.TEMPORARILY_REJECTED
 _LOST = critical("Failsafe activated")
 _NOT_AVAILABLE = critical("Switching to {mode} is currently not available")
 
+_THROTTLE_RAISED = critical("Arming denied: throttle above center")
 _NO_MISSION = critical("Mission start denied! No valid mission")
 _CLEARED = critical("No valid mission available, loitering")
 _RTL, _LAND, _MISSION = "AUTO.RTL", "AUTO.LAND", "AUTO.MISSION"
 _LANDED = ("landed",)
+_AUTOMATIC = " ".join(name for name in MODES if name.startswith("AUTO."))
+_TAKEN = info("Pilot took over using sticks")
 _WITHOUT_STREAM = {0: "POSCTL", 1: "ALTCTL", 2: "STABILIZED", 3: _RTL, 4: _LAND, 5: "AUTO.LOITER"}
 _REGAINED = info("GCS connection regained")
 _WARNINGS = {
@@ -243,14 +263,15 @@ def _delayed(event: str, parameter: str, modes: Mapping[int, str]) -> tuple[Rule
     the parameter selects. A second failsafe during the delay changes only that mode."""
     values = ",".join(map(str, modes))
     hold = critical("Failsafe activated: entering Hold for {delay_s:.0f} seconds")
+    texts = (_WARNINGS[event],) if event in _WARNINGS else ()
     return (
-        Rule(event, when=("action delayed",), do=("failsafe", "delay"), texts=(_WARNINGS[event],)),
+        Rule(event, when=("action delayed",), do=("failsafe", "delay"), texts=texts),
         Rule(
             event,
             when=("armed", "not landed", f"{parameter}={values}"),
             to="AUTO.LOITER",
             do=("failsafe", "delay"),
-            texts=(_WARNINGS[event], hold),
+            texts=(*texts, hold),
         ),
         Rule(
             event + AFTER_DELAY,
@@ -260,6 +281,11 @@ def _delayed(event: str, parameter: str, modes: Mapping[int, str]) -> tuple[Rule
             texts=(_LOST,),
         ),
     )
+
+
+def _with_bit(parameter: str, bit: int) -> str:
+    """The condition that this bit of a parameter is set."""
+    return f"{parameter}={','.join(str(value) for value in range(32) if value >> bit & 1)}"
 
 
 def _says(
@@ -289,6 +315,7 @@ RULES = (
     Rule("land", to="AUTO.LAND", texts=(info("Landing at current position"),)),
     Rule("return", to="AUTO.RTL", texts=(info("Returning to launch"),)),
     Rule("arm", when=("armed",)),
+    _says("arm", _THROTTLE_RAISED, "mode needs sticks", "throttle raised", result=_LATER),
     Rule("arm", when=("ready",), do=("arm",), texts=(info("Armed by external command"),)),
     _says("arm", critical("Arming denied: Resolve system health failures first"), result=_LATER),
     _says("checks", critical("Preflight Fail: horizontal velocity unstable"), "velocity rejected"),
@@ -329,6 +356,32 @@ RULES = (
     Rule("battery low", when=("armed",), texts=(_WARNINGS["battery low"], _LOST)),
     *(Rule(event, texts=(text,)) for event, text in _WARNINGS.items()),
     Rule("ground station found", texts=(_REGAINED,)),
+    Rule("sticks lost", "AUTO.MISSION", when=(_with_bit("COM_RCL_EXCEPT", 0),)),
+    Rule("sticks lost", "AUTO.LOITER AUTO.TAKEOFF", when=(_with_bit("COM_RCL_EXCEPT", 1),)),
+    Rule("sticks lost", "OFFBOARD", when=(_with_bit("COM_RCL_EXCEPT", 2),)),
+    *_delayed("sticks lost", "NAV_RCL_ACT", {2: _RTL, 3: _LAND}),
+    Rule(
+        "sticks lost",
+        when=("armed", "NAV_RCL_ACT=1"),
+        to="AUTO.LOITER",
+        do=("failsafe",),
+        texts=(_LOST,),
+    ),
+    Rule("sticks moved", when=("not armed",)),
+    Rule(
+        "sticks moved",
+        "OFFBOARD",
+        when=(_with_bit("COM_RC_OVERRIDE", 1),),
+        to="POSCTL",
+        texts=(_TAKEN,),
+    ),
+    Rule(
+        "sticks moved",
+        _AUTOMATIC,
+        when=(_with_bit("COM_RC_OVERRIDE", 0),),
+        to="POSCTL",
+        texts=(_TAKEN,),
+    ),
     Rule("position lost", "OFFBOARD", when=("not motion setpoint",)),
     Rule("position lost", when=("armed", "not landed"), to=_LAND, do=("failsafe",), texts=(_LOST,)),
     Rule("position found", when=("since position lost",), to="remembered", do=("recover",)),

@@ -195,14 +195,15 @@ class Server:
         self._sticks(message, pulses if throttle >= 0 else ())
 
     def _sticks(self, message: Message, widths_us: Sequence[int]) -> None:
-        """Apply stick positions. Only the ground station may send them; they count as its
-        heartbeat, too."""
+        """Apply stick positions. Those of the ground station count as its heartbeat, too."""
         autopilot, system = self.view.autopilot, message.get_srcSystem()
-        if autopilot.guidance.sticks is None:
+        firmware, now_s = autopilot.firmware, autopilot.state.time_s
+        if not firmware.takes_sticks_from(system, autopilot.parameters):
             return
-        if autopilot.firmware.is_ground_station(0, system, autopilot.parameters):
-            autopilot.guidance.sticks.override(widths_us, autopilot.state.time_s)
-            autopilot.health.ground_station_heard(autopilot.state.time_s)
+        if firmware.is_ground_station(0, system, autopilot.parameters):
+            autopilot.health.ground_station_heard(now_s)
+        if autopilot.guidance.sticks.override(widths_us, now_s):
+            autopilot.handle("sticks moved")
 
     def _setup_signing(self, message: Message) -> None:
         """Take a new signing key, but not while armed."""

@@ -16,7 +16,7 @@ from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.values import Triple
 from simulator.geodesy import GRAVITY_MPS2, to_degrees
 
-_GPS, _PREARM = 0x20, 0x10000000  # MAV_SYS_STATUS_SENSOR
+_GPS, _RC, _PREARM = 0x20, 0x10000, 0x10000000  # MAV_SYS_STATUS_SENSOR
 
 
 @dataclass(slots=True)
@@ -83,6 +83,8 @@ class View:
             health &= ~_GPS
         if autopilot.commander.healthy:
             health |= _PREARM
+        if not autopilot.health.sticks_lost:
+            present, health = present | _RC, health | _RC
         return present, enabled, health
 
     @property

@@ -1,4 +1,4 @@
-"""The simulated ArduCopter: its default messages, setpoints and their limits, sticks; yaw, speed
+"""The simulated ArduCopter: its default messages, setpoints and their limits; yaw, speed
 and places in automatic flight of both autopilots.
 
 ArduCopter 4.6.3 and PX4 1.16.1 SITL gave the expected values for the same requests."""
@@ -177,7 +177,9 @@ def test_unusable_modes_are_refused_only_while_armed() -> None:
 
 
 def test_lost_ground_station_disarms_only_on_the_ground() -> None:
-    vehicle = loitering()
+    vehicle = aloft(firmware=ARDUPILOT, height_m=30.0, mode="LOITER")
+    vehicle.codec.srcSystem = 255
+    vehicle.run(0.2)
     vehicle.set("FS_GCS_ENABLE", 1)
     vehicle.heartbeat_type = None
     vehicle.run(6.0)
@@ -231,88 +233,6 @@ def test_arducopter_loses_its_position_8_s_after_gps_loss(
     assert vehicle.of("EKF_STATUS_REPORT")[-1][1].flags == 831
     assert (vehicle.mode, vehicle.system_status) == (mode, 4)
     assert vehicle.texts() == texts
-
-
-# -- sticks, by RC_CHANNELS_OVERRIDE and MANUAL_CONTROL ------------------------------------------
-
-KEEP = 65535
-SIMULATED_RC = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
-MIDDLE = (1500, 1500, 1500, 1500)
-
-
-def loitering() -> Bench:
-    bench = aloft(firmware=ARDUPILOT, mode="LOITER")
-    bench.codec.srcSystem = 255
-    push(bench, 0.2, *MIDDLE)
-    return bench
-
-
-def push(bench: Bench, duration_s: float, *widths: int) -> None:
-    filled = (*widths, *(KEEP,) * (8 - len(widths)))
-    message = mavlink.MAVLink_rc_channels_override_message(1, 1, *filled)
-    bench.run(duration_s, lambda: bench.send(message), 0.2)
-
-
-def seen(bench: Bench) -> tuple[int, ...]:
-    bench.command(512, 65)
-    _, channels = bench.of("RC_CHANNELS")[-1]
-    return tuple(getattr(channels, f"chan{i}_raw") for i in range(1, 9))
-
-
-def test_stick_overrides_command_speeds_and_expire() -> None:
-    """As on the real one, throttle is a climb rate, pitch accelerates and a centred stick brakes
-    (speeds after each second). After the override the simulated remote control, throttle at its
-    lower end, makes the vehicle descend."""
-    bench = loitering()
-    for width, climb in ((1700, 0.63), (1300, -0.68), (1580, 0.0)):
-        push(bench, 3.0, 1500, 1500, width, 1500)
-        assert bench.climb_mps == pytest.approx(climb, abs=0.08)
-        height_m = bench.height_m
-        push(bench, 4.0, *MIDDLE)
-        assert bench.height_m == pytest.approx(height_m + 0.35 * climb, abs=0.35)
-    for pitch, ahead_mps, near in (
-        (1400, 0.43, 0.2), (1400, 0.85, 0.2), (1400, 1.15, 0.2), (1400, 1.36, 0.2),
-        (1500, 1.0, 0.35), (1500, 0.3, 0.35), (1500, 0.0, 0.2),
-    ):  # fmt: skip
-        push(bench, 1.0, 1500, pitch, 1500, 1500)
-        assert bench.velocity[0] == pytest.approx(ahead_mps, abs=near)
-    push(bench, 3.0, 1700, 1500, 1500, 1500)
-    assert bench.velocity[1] == pytest.approx(2.65, abs=0.4)
-    push(bench, 3.0, *MIDDLE)
-    assert seen(bench) == (*MIDDLE, *SIMULATED_RC[4:])
-    bench.run(4.5)
-    assert seen(bench) == SIMULATED_RC
-    assert bench.climb_mps == pytest.approx(-2.4, abs=0.3)
-
-
-def test_manual_control_overrides_sticks_and_counts_as_presence() -> None:
-    """32767 is an axis that is not used; a negative throttle, another target or sender changes
-    nothing. A width of zero releases a channel."""
-    bench = loitering()
-    for target, throttle, roll_axis, widths in (
-        (1, 700, 0, (1500, 1500, 1700, 1500)),
-        (1, -1, 500, (1500, 1500, 1700, 1500)),
-        (2, 300, 500, (1500, 1500, 1700, 1500)),
-        (1, 700, 32767, (1500, 1500, 1700, 1500)),
-        (1, 32767, 500, (1750, 1500, 1000, 1500)),
-    ):
-        bench.send(mavlink.MAVLink_manual_control_message(target, 0, roll_axis, throttle, 0, 0))
-        bench.run(0.02)
-        assert seen(bench)[:4] == widths
-    bench.codec.srcSystem = 42
-    push(bench, 0.02, 1100, 1100, 1100, 1100)
-    assert seen(bench)[:4] == widths
-    bench.codec.srcSystem = 255
-    push(bench, 0.02, 0, KEEP, 0, KEEP)
-    assert seen(bench) == (1500, 1500, 1000, 1500, *SIMULATED_RC[4:])
-    bench.set("FS_GCS_ENABLE", 1)
-    bench.heartbeat_type = None
-    joystick = mavlink.MAVLink_manual_control_message(1, 0, 0, 700, 0, 0)
-    bench.run(7.0, lambda: bench.send(joystick), 0.5)
-    assert bench.climb_mps == pytest.approx(0.63, abs=0.1)
-    assert not [text for text in bench.texts() if text.startswith("GCS Failsafe")]
-    bench.run(6.0)
-    assert [text for text in bench.texts() if text.startswith("GCS Failsafe")]
 
 
 # -- yaw, speed and places in automatic flight ---------------------------------------------------
