@@ -13,6 +13,7 @@ from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.px4 import PX4
 
 WAYPOINT, LOITER_TIME, RETURN, TAKEOFF, SPEED = 16, 19, 20, 22, 178
+LOITER_TURNS, TO_ALTITUDE, SPLINE, YAW, JUMP = 18, 31, 82, 115, 177
 RELATIVE_INT, COMMAND_FRAME = 6, 2
 Row = tuple[int, tuple[float, float, float, float], float, float, float]  # north, east, height m
 
@@ -232,3 +233,66 @@ def test_arducopter_mission_restarted_in_the_air_stays_level() -> None:
     assert [m.seq for _, m in bench.of("MISSION_ITEM_REACHED")] == [1, 2]
     assert 5.7 < min(heights_m) < max(heights_m) < 6.3
     assert bench.place[0] == pytest.approx(12.0, abs=1.0)
+
+
+@pytest.mark.parametrize("firmware", [PX4, ARDUPILOT])
+def test_a_jump_repeats_a_part_of_the_mission(firmware: Firmware) -> None:
+    """A jump is not reported as reached. A jump to an item that does not exist is skipped."""
+    bench = aloft(firmware=firmware, height_m=5.0)
+    points = [place(WAYPOINT, north, 0, 5, 0, 0, 0, 0) for north in (0, 0, 8)]
+    upload(bench, [*points, act(JUMP, 1, 2), act(JUMP, 99, -1), place(WAYPOINT, 0, 8, 5)])
+    send(bench, mavlink.MAVLink_mission_set_current_message(1, 1, 1))
+    bench.command(300)
+    bench.run_until(lambda: bench.instance.autopilot.mission.finished, 60.0)
+    assert [m.seq for _, m in bench.of("MISSION_ITEM_REACHED")] == [1, 2] * 3 + [5]
+
+
+@pytest.mark.parametrize("firmware", [PX4, ARDUPILOT])
+def test_a_loop_of_jumps_without_a_place_ends(firmware: Firmware) -> None:
+    bench = aloft(firmware=firmware, height_m=5.0)
+    upload(bench, [place(WAYPOINT, 0, 0, 5, 0, 0, 0, 0)] * 2 + [act(SPEED, 1, 2), act(JUMP, 2, -1)])
+    bench.command(300)
+    bench.run(5.0)
+    assert bench.armed
+    assert bench.place == pytest.approx((0, 0, -5), abs=0.5)
+
+
+def test_arducopter_flies_a_spline_circles_and_climbs() -> None:
+    """It circles at 20 deg/s with its nose to the centre, clockwise for a positive radius."""
+    bench = aloft(firmware=ARDUPILOT, height_m=5.0)
+    home = place(WAYPOINT, 0, 0, 0, 0, 0, 0, 0)
+    circle = place(LOITER_TURNS, 10, 4, 5, 1, 0, 4, 0)
+    upload(
+        bench,
+        [
+            home,
+            place(SPLINE, 10, -8, 5, 0, 0, 0, 0),
+            circle,
+            place(TO_ALTITUDE, 10, 0, 9, 0, 0, 0, 0),
+        ],
+    )
+    bench.command(300)
+    reached = bench.instance.autopilot.mission
+    bench.run_until(lambda: reached.reached == 1, 20.0)
+    assert bench.place == pytest.approx((10, -8, -5), abs=2.5)
+    bench.run(8.0)
+    assert math.dist(bench.place[:2], (10, 4)) == pytest.approx(4.0, abs=0.6)
+    north, east = bench.place[0] - 10, bench.place[1] - 4
+    to_centre = math.degrees(math.atan2(-east, -north))
+    assert abs(math.remainder(bench.heading_deg - to_centre, 360.0)) < 15.0
+    bench.run(2.0)
+    turned = math.atan2(bench.place[1] - 4, bench.place[0] - 10) - math.atan2(east, north)
+    assert math.remainder(turned, math.tau) == pytest.approx(math.radians(40.0), abs=0.15)
+    bench.run_until(lambda: reached.finished, 40.0)
+    assert bench.height_m == pytest.approx(9.0, abs=1.2)
+
+
+def test_arducopter_keeps_the_yaw_of_a_condition_until_the_next_place() -> None:
+    bench = aloft(firmware=ARDUPILOT, height_m=5.0)
+    points = [place(WAYPOINT, north, 0, 5, 0, 0, 0, 0) for north in (0, 12, 24)]
+    upload(bench, [points[0], act(YAW, 90, 0, 1, 0), *points[1:]])
+    bench.command(300)
+    bench.run_until(lambda: bench.instance.autopilot.mission.reached == 2, 20.0)
+    assert bench.heading_deg == pytest.approx(90.0, abs=5.0)
+    bench.run_until(lambda: bench.instance.autopilot.mission.reached == 3, 20.0)
+    assert bench.heading_deg == pytest.approx(0.0, abs=8.0)
