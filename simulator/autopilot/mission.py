@@ -36,9 +36,16 @@ class Kind(IntEnum):
     TURN = 115
     JUMP = 177
     CHANGE_SPEED = 178
+    FACE_PLACE = 195
+    FACE_NONE = 197
+    FACE = 201
 
 
-_PLACES = frozenset(Kind) - {Kind.RETURN, Kind.DELAY, Kind.TURN, Kind.JUMP, Kind.CHANGE_SPEED}
+_PLACES = frozenset({
+    Kind.WAYPOINT, Kind.LOITER_UNLIMITED, Kind.LOITER_TURNS, Kind.LOITER_TIME, Kind.LAND,
+    Kind.TAKEOFF, Kind.LOITER_TO_ALTITUDE, Kind.SPLINE_WAYPOINT,
+})  # fmt: skip
+_FACING = frozenset({Kind.FACE_PLACE, Kind.FACE_NONE, Kind.FACE})
 # param1: duration of stay, s
 _TIMED = frozenset({Kind.WAYPOINT, Kind.LOITER_TIME, Kind.SPLINE_WAYPOINT, Kind.DELAY})
 _CIRCLE_M, _CIRCLE_RADPS = 10.0, math.radians(20.0)  # ArduCopter CIRCLE_RADIUS, CIRCLE_RATE
@@ -67,6 +74,7 @@ class Mission:
     _approaching: bool = False  # whether the current place was not yet reached in the last call
     _bearing_rad: float = 0.0  # from the centre of a circle to the vehicle, when it was reached
     _turned_rad: float = math.nan  # yaw of a TURN, until the next place is reached
+    _faced_ned_m: tuple[float, float] | None = None  # place to which the nose points
     _jumps: dict[int, int] = field(default_factory=dict)  # number of a JUMP -> jumps made
 
     @property
@@ -144,7 +152,7 @@ class Mission:
         item = self.items[self.current]
         if item.command in _PLACES:
             self._target_ned_m = self._target(item, estimate, home_ned_m)
-        yaw_rad = self._yaw_rad(item, estimate.time_s)
+        yaw_rad = self._yaw_rad(item, estimate)
         self._progress(item, estimate, landed)
         self._run_settings(estimate.yaw_rad)
         return MotionSetpoint(self._target_ned_m, yaw_rad=yaw_rad, faces_way=True)
@@ -158,6 +166,7 @@ class Mission:
             self._jumps.clear()
         self._target_ned_m = here_ned_m
         self._since_s = self._climb_down_m = self._turned_rad = math.nan
+        self._faced_ned_m = None
         first = next((item for item in self.items[self.current :] if item.command in _PLACES), None)
         if landed and first is not None and first.command != Kind.LAND:
             self._climb_down_m = self._position(first, home_ned_m)[2]
@@ -193,6 +202,9 @@ class Mission:
             if item.command == Kind.JUMP:
                 self._jump(item)
                 continue
+            if item.command in _FACING:
+                place = to_metres(self.firmware.origin, item.x * 1e-7, item.y * 1e-7)
+                self._faced_ned_m = place if item.x or item.y else None
             if item.command == Kind.TURN:
                 angle_deg, _, sense, relative = item.params
                 turn_rad = math.radians(angle_deg if sense >= 0.0 or not relative else -angle_deg)
@@ -289,12 +301,15 @@ class Mission:
         stay_s = item.params[0] if item.command in _TIMED else 0.0
         return stay_s if math.isfinite(stay_s) else 0.0
 
-    def _yaw_rad(self, item: MissionItem, now_s: float) -> float:
-        """Yaw that an item demands; NaN: the nose points in the direction of flight."""
+    def _yaw_rad(self, item: MissionItem, estimate: StateEstimate) -> float:
+        """Yaw that the mission demands; NaN: the nose points in the direction of flight."""
+        if self._faced_ned_m is not None:
+            north, east = self._faced_ned_m
+            return math.atan2(east - estimate.position_ned_m[1], north - estimate.position_ned_m[0])
         if not math.isnan(self._turned_rad):
             return self._turned_rad
         if item.command == Kind.LOITER_TURNS and not math.isnan(self._since_s):
-            return wrap_pi(self._circle_rad(item, now_s) + math.pi)
+            return wrap_pi(self._circle_rad(item, estimate.time_s) + math.pi)
         yaw_deg = item.params[3]
         if item.command in self.firmware.turning_items and math.isfinite(yaw_deg):
             return wrap_pi(math.radians(yaw_deg))

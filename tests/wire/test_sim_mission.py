@@ -14,6 +14,7 @@ from simulator.firmware.px4 import PX4
 
 WAYPOINT, LOITER_TIME, RETURN, TAKEOFF, SPEED = 16, 19, 20, 22, 178
 LOITER_TURNS, TO_ALTITUDE, SPLINE, YAW, JUMP = 18, 31, 82, 115, 177
+REGION, NO_REGION = 195, 197
 RELATIVE_INT, COMMAND_FRAME = 6, 2
 Row = tuple[int, tuple[float, float, float, float], float, float, float]  # north, east, height m
 
@@ -296,3 +297,16 @@ def test_arducopter_keeps_the_yaw_of_a_condition_until_the_next_place() -> None:
     assert bench.heading_deg == pytest.approx(90.0, abs=5.0)
     bench.run_until(lambda: bench.instance.autopilot.mission.reached == 3, 20.0)
     assert bench.heading_deg == pytest.approx(0.0, abs=8.0)
+
+
+@pytest.mark.parametrize("firmware", [PX4, ARDUPILOT])
+def test_a_mission_faces_a_region_of_interest_until_there_is_none(firmware: Firmware) -> None:
+    bench = aloft(firmware=firmware, height_m=5.0)
+    points = [place(WAYPOINT, north, 0, 5) for north in (0, 9, 18, 36)]
+    region, none = place(REGION, 18, 9, 0, 0, 0, 0, 0), act(NO_REGION)
+    upload(bench, [points[0], region, *points[1:3], none, points[3]])
+    bench.command(300)
+    bench.run_until(lambda: bench.instance.autopilot.mission.reached == 2, 20.0)
+    assert bench.heading_deg == pytest.approx(45.0, abs=15.0)
+    bench.run_until(lambda: bench.instance.autopilot.mission.finished, 30.0)
+    assert bench.heading_deg == pytest.approx(0.0, abs=10.0)
