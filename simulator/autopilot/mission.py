@@ -99,14 +99,19 @@ class Mission:
         places = (item.command for item in self.items[self.first :] if item.command in _PLACES)
         return next(places, None) == Kind.TAKEOFF
 
-    def store(self, items: tuple[MissionItem, ...], kind: int = 0) -> None:
-        """Replace the items of a MAV_MISSION_TYPE. A new mission starts from its beginning."""
+    def store(
+        self, items: tuple[MissionItem, ...], kind: int = 0, *, continues: bool = False
+    ) -> None:
+        """Replace the items of a MAV_MISSION_TYPE. A new mission starts from its beginning, unless
+        it continues the present one."""
         self.stored[kind] = items
         if kind:
             return
         if self.under_way and not items:
             self.events.append("mission cleared")
         self.parameters.set("MIS_TOTAL", len(items))  # PX4 has no such parameter
+        if continues:
+            return
         self.current, self.reached, self.finished = self.first, -1, False
         self.speed_mps, self._since_s = math.inf, math.nan
         self._jumps.clear()

@@ -310,3 +310,20 @@ def test_a_mission_faces_a_region_of_interest_until_there_is_none(firmware: Firm
     assert bench.heading_deg == pytest.approx(45.0, abs=15.0)
     bench.run_until(lambda: bench.instance.autopilot.mission.finished, 30.0)
     assert bench.heading_deg == pytest.approx(0.0, abs=10.0)
+
+
+def test_arducopter_replaces_a_part_of_its_mission() -> None:
+    """MAVProxy's `wp changealt`, `wp move` and others do so. PX4 has no such message."""
+    bench = aloft(firmware=ARDUPILOT, height_m=5.0)
+    points = [place(WAYPOINT, north, 0, 5) for north in (0, 0, 20, 30)]
+    upload(bench, points)
+    send(bench, mavlink.MAVLink_mission_set_current_message(1, 1, 2))
+    send(bench, mavlink.MAVLink_mission_write_partial_list_message(1, 1, 2, 2))
+    assert asked(bench)[-1] == 2
+    send(bench, item(bench, 2, place(WAYPOINT, 0, 9, 7)))
+    assert acks(bench) == [0, 0]
+    mission = bench.instance.autopilot.mission
+    assert (mission.current, len(mission.items)) == (2, 4)
+    assert [each.z for each in mission.items] == [5, 5, 7, 5]
+    send(bench, mavlink.MAVLink_mission_write_partial_list_message(1, 1, 5, 5))
+    assert acks(bench)[-1] == 1
