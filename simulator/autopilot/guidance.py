@@ -98,7 +98,7 @@ class Guidance:
         self.home_yaw_rad = 0.0
         self.cruise_mps = math.inf  # speed requested for automatic flight; inf: none
         self.region_ned_m: tuple[float, float] | None = (
-            None  # region of interest, faced while holding or following setpoints without a yaw
+            None  # region of interest, faced until the next setpoint
         )
         self._behaviours = behaviours
         self.behaviour = Behaviour.HOLD
@@ -129,8 +129,10 @@ class Guidance:
         self.mission.pause()
 
     def follow(self, setpoint: Setpoint) -> None:
-        """Follow a client's setpoint. Where setpoints are flown as automatic flight (ArduCopter), a
-        setpoint of another kind than the last one resets the requested speed."""
+        """Follow a client's setpoint, and no longer face a region of interest. Where setpoints are
+        flown as automatic flight (ArduCopter), a setpoint of another kind than the last one resets
+        the requested speed."""
+        self.region_ned_m = None
         if self.firmware.setpoints_as_automatic and _kind(setpoint) != _kind(self.newest):
             self.cruise_mps = math.inf
         self.newest = setpoint
