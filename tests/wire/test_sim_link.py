@@ -175,6 +175,13 @@ def asked(bench: Bench, name: bytes) -> tuple[float, int]:
     return message.param_value, message.param_type
 
 
+@pytest.mark.parametrize("name", [b"FLW_TGT_DST", b"SYS_FAILURE_EN"])
+def test_px4_has_the_parameters_that_examples_of_mavsdk_set(name: bytes) -> None:
+    """Without an answer MAVSDK repeats its requests for 6 s per parameter, then gives up."""
+    bench = Bench()
+    asked(bench, name)
+
+
 def test_the_parameter_hash_changes_with_the_values() -> None:
     """QGroundControl reads the hash; a client that knows it stops the list of parameters."""
     bench = Bench()
