@@ -96,6 +96,7 @@ class Guidance:
         self.hold = MotionSetpoint(ORIGIN)
         self.home_ned_m = ORIGIN
         self.home_yaw_rad = 0.0
+        self.home_kept = False  # whether a client set home, which is then kept when it arms
         self.cruise_mps = math.inf  # speed requested for automatic flight; inf: none
         self.region_ned_m: tuple[float, float] | None = (
             None  # region of interest, faced until the next setpoint
@@ -123,8 +124,9 @@ class Guidance:
         self._entered, self._place_ned_m = False, place_ned_m
 
     def arm(self, estimate: StateEstimate) -> None:
-        """Set home and the place to hold, when the motors start."""
-        self.home_ned_m, self.home_yaw_rad = estimate.position_ned_m, estimate.yaw_rad
+        """Set home, unless a client has done so, and the place to hold, when the motors start."""
+        if not self.home_kept:
+            self.home_ned_m, self.home_yaw_rad = estimate.position_ned_m, estimate.yaw_rad
         self.hold = MotionSetpoint(estimate.position_ned_m)
         self.mission.pause()
 

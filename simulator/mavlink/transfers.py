@@ -239,8 +239,10 @@ class MissionTransfer:
         self.outbox.send(name, *head, current, 1, *item.params, *places, item.z, kind)
 
     def _home(self) -> MissionItem:
-        """Home as a mission item."""
+        """Home as a mission item; zeros before it is set."""
         view = self.outbox.view
+        if view.withheld("HOME_POSITION"):
+            return MissionItem(0, Kind.WAYPOINT, (0.0,) * 4, 0, 0, 0.0)
         north_m, east_m, down_m = view.autopilot.guidance.home_ned_m
         place = view.geodetic(north_m, east_m)
         return MissionItem(0, Kind.WAYPOINT, (0.0,) * 4, *place, view.altitude_mm(down_m) * 1e-3)

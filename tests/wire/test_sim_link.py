@@ -47,8 +47,8 @@ def test_garbage_in_a_datagram_hides_no_frame(garbage: bytes) -> None:
 def test_only_arducopter_obeys_messages_to_system_zero(name: str, obeyed: bool) -> None:
     """PX4 1.16 ignores commands, parameters and missions for system 0, except a request for its
     version."""
-    bench = Bench(firmware=FIRMWARES[name])
-    bench.run(1.0)
+    bench = Bench(firmware=FIRMWARES[name], boot_scale=0.1)
+    bench.run(2.5)
     bench.system = 0
     ask_version, set_home = (bench.command(520), bench.command(179, 1))
     bench.send(mavlink.MAVLink_param_request_read_message(0, 1, b"SYSID_MYGCS", -1))

@@ -176,9 +176,15 @@ def test_waypoint_radius_follows_the_parameter(
 
 
 def test_the_first_item_of_arducopter_is_home() -> None:
-    """Scripts that download an empty mission wait for home. MIS_TOTAL counts it, too."""
-    bench = Bench(firmware=ARDUPILOT)
+    """Scripts that download an empty mission wait for home, which is zero until it is set.
+    MIS_TOTAL counts it, too."""
+    bench = Bench(firmware=ARDUPILOT, boot_scale=0.1)
     bench.run(1.0)
+    send(bench, mavlink.MAVLink_mission_request_message(1, 1, 0))
+    home = bench.of("MISSION_ITEM")[-1][1]
+    assert (home.x, home.y, home.z) == (0, 0, 0)
+    assert bench.command(179, 0, 0, 0, 0, *degrees(bench, 9, 0), 584) == [4]
+    bench.run(1.5)
     for _ in range(2):
         send(bench, mavlink.MAVLink_mission_request_message(1, 1, 0))
         home = bench.of("MISSION_ITEM")[-1][1]
@@ -327,3 +333,23 @@ def test_arducopter_replaces_a_part_of_its_mission() -> None:
     assert [each.z for each in mission.items] == [5, 5, 7, 5]
     send(bench, mavlink.MAVLink_mission_write_partial_list_message(1, 1, 5, 5))
     assert acks(bench)[-1] == 1
+
+
+@pytest.mark.parametrize(("firmware", "keeps_present"), [(PX4, False), (ARDUPILOT, True)])
+def test_a_home_that_a_client_sets_is_kept_when_the_vehicle_arms(
+    firmware: Firmware, *, keeps_present: bool
+) -> None:
+    """PX4 does not keep the present position as home, ArduCopter does."""
+    bench = Bench(firmware=firmware, boot_scale=0.1)
+    bench.run(4.5)
+    guidance = bench.instance.autopilot.guidance
+    height_m = firmware.origin[2] + 3.0
+    for params in ((0, 0, 0, 0, *degrees(bench, 12.0, 0.0), height_m), (1,)):
+        assert bench.command(179, *params) == [0]
+        before = guidance.home_ned_m
+        if firmware is ARDUPILOT:
+            assert bench.command(176, 1, 4) == [0]
+        assert bench.command(400, 1) == [0]
+        assert (guidance.home_ned_m == before) is (params[0] == 0 or keeps_present)
+        bench.command(400, 0)
+        bench.run(1.0)
