@@ -279,7 +279,11 @@ class Commands:
         return Result.ACCEPTED
 
     def _request_message(self, autopilot: Autopilot, command: Command) -> Result:
-        return self._send(message_name(command.params[0]))
+        """MAV_CMD_REQUEST_MESSAGE: ArduCopter accepts it for a message that it cannot send yet."""
+        name = message_name(command.params[0])
+        if name is not None and self.outbox.view.withheld(name):
+            return Result.ACCEPTED
+        return self._send(name)
 
     def _send(self, name: str | None) -> Result:
         view, firmware = self.outbox.view, self._autopilot.firmware

@@ -184,6 +184,8 @@ def test_the_first_item_of_arducopter_is_home() -> None:
     home = bench.of("MISSION_ITEM")[-1][1]
     assert (home.x, home.y, home.z) == (0, 0, 0)
     assert bench.command(179, 0, 0, 0, 0, *degrees(bench, 9, 0), 584) == [4]
+    assert (bench.command(410), bench.command(512, 242)) == ([4], [0])
+    assert not bench.of("HOME_POSITION")
     bench.run(1.5)
     for _ in range(2):
         send(bench, mavlink.MAVLink_mission_request_message(1, 1, 0))
