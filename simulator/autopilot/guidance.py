@@ -95,9 +95,10 @@ class Guidance:
         self.hold = MotionSetpoint(ORIGIN)
         self.home_ned_m = ORIGIN
         self.home_yaw_rad = 0.0
+        self.home_kept = False  # whether a client set home, which is then kept when it arms
         self.cruise_mps = math.inf  # speed requested for automatic flight; inf: none
         self.region_ned_m: tuple[float, float] | None = (
-            None  # region of interest, faced while holding or following setpoints without a yaw
+            None  # region of interest, faced until the next setpoint
         )
         self._behaviours = behaviours
         self.behaviour = Behaviour.HOLD
@@ -122,14 +123,17 @@ class Guidance:
         self._entered, self._place_ned_m = False, place_ned_m
 
     def arm(self, estimate: StateEstimate) -> None:
-        """Set home and the place to hold, when the motors start."""
-        self.home_ned_m, self.home_yaw_rad = estimate.position_ned_m, estimate.yaw_rad
+        """Set home, unless a client has done so, and the place to hold, when the motors start."""
+        if not self.home_kept:
+            self.home_ned_m, self.home_yaw_rad = estimate.position_ned_m, estimate.yaw_rad
         self.hold = MotionSetpoint(estimate.position_ned_m)
         self.mission.pause()
 
     def follow(self, setpoint: Setpoint) -> None:
-        """Follow a client's setpoint. Where setpoints are flown as automatic flight (ArduCopter), a
-        setpoint of another kind than the last one resets the requested speed."""
+        """Follow a client's setpoint, and no longer face a region of interest. Where setpoints are
+        flown as automatic flight (ArduCopter), a setpoint of another kind than the last one resets
+        the requested speed."""
+        self.region_ned_m = None
         if self.firmware.setpoints_as_automatic and _kind(setpoint) != _kind(self.newest):
             self.cruise_mps = math.inf
         self.newest = setpoint

@@ -25,18 +25,30 @@ class Kind(IntEnum):
 
     WAYPOINT = 16
     LOITER_UNLIMITED = 17
+    LOITER_TURNS = 18
     LOITER_TIME = 19
     RETURN = 20
     LAND = 21
     TAKEOFF = 22
+    LOITER_TO_ALTITUDE = 31
+    SPLINE_WAYPOINT = 82  # flown in a straight line
     DELAY = 93
+    TURN = 115
+    JUMP = 177
     CHANGE_SPEED = 178
+    FACE_PLACE = 195
+    FACE_NONE = 197
+    FACE = 201
 
 
-_PLACES = frozenset(
-    {Kind.WAYPOINT, Kind.LOITER_UNLIMITED, Kind.LOITER_TIME, Kind.LAND, Kind.TAKEOFF}
-)
-_TIMED = frozenset({Kind.WAYPOINT, Kind.LOITER_TIME, Kind.DELAY})  # param1: duration of stay, s
+_PLACES = frozenset({
+    Kind.WAYPOINT, Kind.LOITER_UNLIMITED, Kind.LOITER_TURNS, Kind.LOITER_TIME, Kind.LAND,
+    Kind.TAKEOFF, Kind.LOITER_TO_ALTITUDE, Kind.SPLINE_WAYPOINT,
+})  # fmt: skip
+_FACING = frozenset({Kind.FACE_PLACE, Kind.FACE_NONE, Kind.FACE})
+# param1: duration of stay, s
+_TIMED = frozenset({Kind.WAYPOINT, Kind.LOITER_TIME, Kind.SPLINE_WAYPOINT, Kind.DELAY})
+_CIRCLE_M, _CIRCLE_RADPS = 10.0, math.radians(20.0)  # ArduCopter CIRCLE_RADIUS, CIRCLE_RATE
 
 
 @dataclass(slots=True)
@@ -60,6 +72,10 @@ class Mission:
     _since_s: float = math.nan  # time at which the current place was reached
     _target_ned_m: Triple = NAN3
     _approaching: bool = False  # whether the current place was not yet reached in the last call
+    _bearing_rad: float = 0.0  # from the centre of a circle to the vehicle, when it was reached
+    _turned_rad: float = math.nan  # yaw of a TURN, until the next place is reached
+    _faced_ned_m: tuple[float, float] | None = None  # place to which the nose points
+    _jumps: dict[int, int] = field(default_factory=dict)  # number of a JUMP -> jumps made
 
     @property
     def items(self) -> tuple[MissionItem, ...]:
@@ -83,16 +99,22 @@ class Mission:
         places = (item.command for item in self.items[self.first :] if item.command in _PLACES)
         return next(places, None) == Kind.TAKEOFF
 
-    def store(self, items: tuple[MissionItem, ...], kind: int = 0) -> None:
-        """Replace the items of a MAV_MISSION_TYPE. A new mission starts from its beginning."""
+    def store(
+        self, items: tuple[MissionItem, ...], kind: int = 0, *, continues: bool = False
+    ) -> None:
+        """Replace the items of a MAV_MISSION_TYPE. A new mission starts from its beginning, unless
+        it continues the present one."""
         self.stored[kind] = items
         if kind:
             return
         if self.under_way and not items:
             self.events.append("mission cleared")
         self.parameters.set("MIS_TOTAL", len(items))  # PX4 has no such parameter
+        if continues:
+            return
         self.current, self.reached, self.finished = self.first, -1, False
         self.speed_mps, self._since_s = math.inf, math.nan
+        self._jumps.clear()
 
     def go_to(self, number: int) -> bool:
         """Continue with this item, or with the first one if `number` is home's (ArduCopter). Return
@@ -129,15 +151,16 @@ class Mission:
             if estimate.position_ned_m[2] < self._climb_down_m + within_m:
                 self._climb_down_m = math.nan
             return MotionSetpoint(self._target_ned_m)
-        self._run_settings()
+        self._run_settings(estimate.yaw_rad)
         if not self._has_item:
             return MotionSetpoint(self._target_ned_m)
         item = self.items[self.current]
         if item.command in _PLACES:
-            self._target_ned_m = self._target(item, estimate.position_ned_m, home_ned_m)
+            self._target_ned_m = self._target(item, estimate, home_ned_m)
+        yaw_rad = self._yaw_rad(item, estimate)
         self._progress(item, estimate, landed)
-        self._run_settings()
-        return MotionSetpoint(self._target_ned_m, yaw_rad=self._yaw_rad(item), faces_way=True)
+        self._run_settings(estimate.yaw_rad)
+        return MotionSetpoint(self._target_ned_m, yaw_rad=yaw_rad, faces_way=True)
 
     def _begin(self, here_ned_m: Triple, home_ned_m: Triple, landed: bool) -> None:
         """Start the mission, or continue it where it was paused. A finished one starts again."""
@@ -145,8 +168,10 @@ class Mission:
         if self.finished:
             self.go_to(0)
             self.speed_mps = math.inf
+            self._jumps.clear()
         self._target_ned_m = here_ned_m
-        self._since_s = self._climb_down_m = math.nan
+        self._since_s = self._climb_down_m = self._turned_rad = math.nan
+        self._faced_ned_m = None
         first = next((item for item in self.items[self.current :] if item.command in _PLACES), None)
         if landed and first is not None and first.command != Kind.LAND:
             self._climb_down_m = self._position(first, home_ned_m)[2]
@@ -172,12 +197,23 @@ class Mission:
             self._report_reached()
             self._advance()
 
-    def _run_settings(self) -> None:
-        """Carry out items that take no time; of several in a row, only the last is reported."""
-        while self._has_item:
+    def _run_settings(self, yaw_rad: float) -> None:
+        """Carry out items that take no time; of several in a row, only the last is reported. A loop
+        of jumps without a place ends."""
+        for _ in self.items:
             item = self.items[self.current]
-            if item.command in _PLACES or item.command == Kind.DELAY:
+            if not self._has_item or item.command in _PLACES or item.command == Kind.DELAY:
                 return
+            if item.command == Kind.JUMP:
+                self._jump(item)
+                continue
+            if item.command in _FACING:
+                place = to_metres(self.firmware.origin, item.x * 1e-7, item.y * 1e-7)
+                self._faced_ned_m = place if item.x or item.y else None
+            if item.command == Kind.TURN:
+                angle_deg, _, sense, relative = item.params
+                turn_rad = math.radians(angle_deg if sense >= 0.0 or not relative else -angle_deg)
+                self._turned_rad = wrap_pi(turn_rad + (yaw_rad if relative else 0.0))
             vertical = item.params[0] in self.firmware.vertical_speeds
             if item.command == Kind.CHANGE_SPEED and item.params[1] > 0 and not vertical:
                 self.speed_mps = item.params[1]
@@ -187,9 +223,22 @@ class Mission:
                 self._report_reached()
                 self._advance()
 
+    def _jump(self, item: MissionItem) -> None:
+        """Jump to item param1, at most param2 times; a negative number: always."""
+        target, times = item.params[:2]
+        made = self._jumps.get(self.current, 0)
+        if self.first <= target < len(self.items) and (times < 0 or made < times):
+            self._jumps[self.current] = made + 1
+            self.current = int(target)
+            self._report("mission progress")
+        else:
+            self._advance()
+
     def _advance(self) -> None:
         """Go to the next item, or finish."""
         self._since_s = math.nan
+        if self.items[self.current].command in _PLACES:
+            self._turned_rad = math.nan
         if self.current + 1 < len(self.items):
             self.current += 1
             self._report("mission progress")
@@ -217,14 +266,27 @@ class Mission:
             north, east = self._target_ned_m[:2]
         return north, east, down_m(item.z, item.frame, self.firmware.origin, home_ned_m[2])
 
-    def _target(self, item: MissionItem, here_ned_m: Triple, home_ned_m: Triple) -> Triple:
+    def _target(self, item: MissionItem, estimate: StateEstimate, home_ned_m: Triple) -> Triple:
+        here_ned_m = estimate.position_ned_m
         north, east, down = self._position(item, home_ned_m)
         if item.command == Kind.TAKEOFF:
             north, east = self._target_ned_m[:2]
             down = min(down, here_ned_m[2]) if self.firmware.takeoff_items_climb else down
         if item.command == Kind.LAND:
             down = here_ned_m[2] if self.landing else self._target_ned_m[2]
+        if item.command == Kind.LOITER_TURNS:
+            if math.isnan(self._since_s):  # the nearest place of the circle
+                self._bearing_rad = math.atan2(here_ned_m[1] - east, here_ned_m[0] - north)
+            bearing_rad = self._circle_rad(item, estimate.time_s)
+            radius_m = abs(_finite_or_zero(item.params[2])) or _CIRCLE_M
+            north += radius_m * math.cos(bearing_rad)
+            east += radius_m * math.sin(bearing_rad)
         return north, east, down
+
+    def _circle_rad(self, item: MissionItem, now_s: float) -> float:
+        """Bearing of the target from the centre of a circle. A negative radius: anticlockwise."""
+        moved_s = 0.0 if math.isnan(self._since_s) else now_s - self._since_s
+        return self._bearing_rad + math.copysign(moved_s * _CIRCLE_RADPS, item.params[2])
 
     def _near(self, item: MissionItem, here_ned_m: Triple) -> bool:
         if item.command not in _PLACES:
@@ -239,12 +301,24 @@ class Mission:
     def _stay_s(self, item: MissionItem) -> float:
         if item.command in (Kind.LOITER_UNLIMITED, Kind.LAND):
             return math.inf
-        stay_s = item.params[0] if item.command in _TIMED else 0.0
-        return stay_s if math.isfinite(stay_s) else 0.0
+        if item.command == Kind.LOITER_TURNS:
+            return _finite_or_zero(item.params[0]) * math.tau / _CIRCLE_RADPS
+        return _finite_or_zero(item.params[0]) if item.command in _TIMED else 0.0
 
-    def _yaw_rad(self, item: MissionItem) -> float:
-        """Yaw that an item demands; NaN: the nose points in the direction of flight."""
+    def _yaw_rad(self, item: MissionItem, estimate: StateEstimate) -> float:
+        """Yaw that the mission demands; NaN: the nose points in the direction of flight."""
+        if self._faced_ned_m is not None:
+            north, east = self._faced_ned_m
+            return math.atan2(east - estimate.position_ned_m[1], north - estimate.position_ned_m[0])
+        if not math.isnan(self._turned_rad):
+            return self._turned_rad
+        if item.command == Kind.LOITER_TURNS and not math.isnan(self._since_s):
+            return wrap_pi(self._circle_rad(item, estimate.time_s) + math.pi)
         yaw_deg = item.params[3]
         if item.command in self.firmware.turning_items and math.isfinite(yaw_deg):
             return wrap_pi(math.radians(yaw_deg))
         return math.nan
+
+
+def _finite_or_zero(value: float) -> float:
+    return value if math.isfinite(value) else 0.0

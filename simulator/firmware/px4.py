@@ -261,7 +261,8 @@ PX4 = Px4(
     never_sent=telemetry.NEVER_SENT,
     interval_refusal=Result.FAILED,
     request_refusal=Result.DENIED,
-    ignored=frozenset({"RC_CHANNELS_OVERRIDE"}),  # RC channels without RC_MAP_*
+    # partial lists have no handler, RC channels no RC_MAP_*
+    ignored=frozenset({"MISSION_WRITE_PARTIAL_LIST", "RC_CHANNELS_OVERRIDE"}),
     target_component_checked=True,
     never_to_all=frozenset({"COMMAND", "MISSION", "PARAM"}),
     text_suffix="\t",

@@ -87,6 +87,12 @@ PARAMETERS = (
     _real("COM_SPOOLUP_TIME", 1.0, 0, 30),  # s from arming until takeoff may begin
     _int("COM_TAKEOFF_ACT", 0, 0, 1),  # after takeoff: 0 hold
     _int("EKF2_NOAID_TOUT", 5000000, 500000, 10000000),  # us without aiding until position is lost
+    _int("FLW_TGT_ALT_M", 0, 0, 2),  # follow-me, as the next five; without effect
+    _real("FLW_TGT_DST", 8.0, 1, 1e6),  # m
+    _real("FLW_TGT_FA", 180.0, -180, 180),  # deg
+    _real("FLW_TGT_HT", 8.0, 8, 1e6),  # m
+    _real("FLW_TGT_MAX_VEL", 5.0, 0, 20),  # m/s
+    _real("FLW_TGT_RS", 0.1, 0, 1),  # responsiveness
     _int("GF_ACTION", 2, 0, 5),  # geofence: 2 hold
     _real("GF_MAX_HOR_DIST", 0.0, 0, 10000),  # m, geofence; without effect
     _real("GF_MAX_VER_DIST", 0.0, 0, 10000),  # m, geofence; without effect
@@ -146,6 +152,7 @@ PARAMETERS = (
     _int("RTL_TYPE", 0, 0, 5),  # 0 home or rally point
     _int("SYS_AUTOCONFIG", 0, 0, 1),  # set up the airframe at start
     _int("SYS_AUTOSTART", 10040, 0, 9999999),  # airframe
+    _int("SYS_FAILURE_EN", 0, 0, 1),  # failure injection; without effect
     _int("SYS_HAS_GPS", 1, 0, 1),  # 1: has GPS
 )
 

@@ -113,16 +113,22 @@ class Commands:
         return autopilot.handle("takeoff", Request(takeoff_ned_m=(north, east, down)))
 
     def _set_home(self, autopilot: Autopilot, command: Command) -> Result:
-        """MAV_CMD_DO_SET_HOME: home is the present position (param1 = 1), or a place in degrees and
-        AMSL metres."""
+        """MAV_CMD_DO_SET_HOME: home is the present position (param1 = 1; ArduCopter: also latitude
+        and longitude 0), or a place in degrees and AMSL metres. It is kept when the vehicle arms,
+        but PX4 does not keep a present position."""
         latitude, longitude, height_m = command.params[4:7]
-        if command.params[0] == 1.0:
+        strict = autopilot.firmware.strict_places
+        here = command.params[0] == 1.0 or (strict and latitude == longitude == 0.0)
+        if self.outbox.view.withheld("HOME_POSITION"):
+            return autopilot.firmware.request_refusal
+        if here:
             autopilot.guidance.home_ned_m = autopilot.state.estimate.position_ned_m
         elif math.isfinite(latitude + longitude) and abs(height_m) <= _HEIGHT_MAX_M:
             north, east = to_metres(autopilot.firmware.origin, latitude, longitude)
             autopilot.guidance.home_ned_m = (north, east, autopilot.firmware.origin[2] - height_m)
         else:
             return Result.DENIED
+        autopilot.guidance.home_kept = strict or not here
         return autopilot.handle("home")
 
     def _reposition(self, autopilot: Autopilot, command: Command) -> Result:
@@ -273,7 +279,11 @@ class Commands:
         return Result.ACCEPTED
 
     def _request_message(self, autopilot: Autopilot, command: Command) -> Result:
-        return self._send(message_name(command.params[0]))
+        """MAV_CMD_REQUEST_MESSAGE: ArduCopter accepts it for a message that it cannot send yet."""
+        name = message_name(command.params[0])
+        if name is not None and self.outbox.view.withheld(name):
+            return Result.ACCEPTED
+        return self._send(name)
 
     def _send(self, name: str | None) -> Result:
         view, firmware = self.outbox.view, self._autopilot.firmware

@@ -241,6 +241,9 @@ HANDLERS: dict[str, Callable[[Server, Message], None]] = {
     **dict.fromkeys((ATTITUDE, LOCAL, GLOBAL), Server._setpoint),
     "MISSION_ACK": lambda server, message: server._missions.ack(message),
     "MISSION_COUNT": lambda server, message: server._missions.count(message),
+    "MISSION_WRITE_PARTIAL_LIST": lambda server, message: server._missions.write_partial_list(
+        message
+    ),
     "MISSION_ITEM": Server._mission_item,
     "MISSION_ITEM_INT": Server._mission_item,
     "MISSION_REQUEST_LIST": lambda server, message: server._missions.request_list(message),

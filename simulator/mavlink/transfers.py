@@ -99,6 +99,7 @@ class Upload:
     items: list[MissionItem]  # received so far
     begun_s: float  # time since boot of the last progress
     requested_s: float  # time since boot of the last request
+    rest: tuple[MissionItem, ...] | None = None  # stored items after the replaced ones; None: all
 
 
 class MissionTransfer:
@@ -144,6 +145,20 @@ class MissionTransfer:
             self._upload = Upload(peer, kind, message.count, [], self._now_s, self._now_s)
             self._request_item(self._upload)
 
+    def write_partial_list(self, message: Message) -> None:
+        """Handle MISSION_WRITE_PARTIAL_LIST: begin to replace some of the stored items."""
+        peer, kind = sender_of(message), message.mission_type
+        first, last = message.start_index, message.end_index
+        stored = self.mission.stored.get(kind)
+        if stored is None:
+            self._acknowledge(peer, Ack.UNSUPPORTED, kind)
+        elif not 0 <= first <= last <= min(len(stored), ITEMS_MAX - 1):
+            self._acknowledge(peer, Ack.ERROR, kind)
+        else:
+            kept, rest, now_s = list(stored[:first]), stored[last + 1 :], self._now_s
+            self._upload = Upload(peer, kind, last + 1, kept, now_s, now_s, rest)
+            self._request_item(self._upload)
+
     def _request_item(self, upload: Upload) -> None:
         upload.requested_s = self._now_s
         whole = self._whole and self._firmware.requests_kind_of_peer
@@ -177,7 +192,8 @@ class MissionTransfer:
         if len(upload.items) < upload.count:
             self._request_item(upload)
             return
-        self.mission.store(tuple(upload.items), kind)
+        items = (*upload.items, *(upload.rest or ()))
+        self.mission.store(items, kind, continues=upload.rest is not None)
         self._upload, self._taken = None, (kind, upload.count)
         self._acknowledge(upload.peer, Ack.ACCEPTED, kind)
         if not kind and self._firmware.mission_text is not None:
@@ -223,8 +239,10 @@ class MissionTransfer:
         self.outbox.send(name, *head, current, 1, *item.params, *places, item.z, kind)
 
     def _home(self) -> MissionItem:
-        """Home as a mission item."""
+        """Home as a mission item; zeros before it is set."""
         view = self.outbox.view
+        if view.withheld("HOME_POSITION"):
+            return MissionItem(0, Kind.WAYPOINT, (0.0,) * 4, 0, 0, 0.0)
         north_m, east_m, down_m = view.autopilot.guidance.home_ned_m
         place = view.geodetic(north_m, east_m)
         return MissionItem(0, Kind.WAYPOINT, (0.0,) * 4, *place, view.altitude_mm(down_m) * 1e-3)

@@ -13,6 +13,8 @@ from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.px4 import PX4
 
 WAYPOINT, LOITER_TIME, RETURN, TAKEOFF, SPEED = 16, 19, 20, 22, 178
+LOITER_TURNS, TO_ALTITUDE, SPLINE, YAW, JUMP = 18, 31, 82, 115, 177
+REGION, NO_REGION = 195, 197
 RELATIVE_INT, COMMAND_FRAME = 6, 2
 Row = tuple[int, tuple[float, float, float, float], float, float, float]  # north, east, height m
 
@@ -174,9 +176,17 @@ def test_waypoint_radius_follows_the_parameter(
 
 
 def test_the_first_item_of_arducopter_is_home() -> None:
-    """Scripts that download an empty mission wait for home. MIS_TOTAL counts it, too."""
-    bench = Bench(firmware=ARDUPILOT)
+    """Scripts that download an empty mission wait for home, which is zero until it is set.
+    MIS_TOTAL counts it, too."""
+    bench = Bench(firmware=ARDUPILOT, boot_scale=0.1)
     bench.run(1.0)
+    send(bench, mavlink.MAVLink_mission_request_message(1, 1, 0))
+    home = bench.of("MISSION_ITEM")[-1][1]
+    assert (home.x, home.y, home.z) == (0, 0, 0)
+    assert bench.command(179, 0, 0, 0, 0, *degrees(bench, 9, 0), 584) == [4]
+    assert (bench.command(410), bench.command(512, 242)) == ([4], [0])
+    assert not bench.of("HOME_POSITION")
+    bench.run(1.5)
     for _ in range(2):
         send(bench, mavlink.MAVLink_mission_request_message(1, 1, 0))
         home = bench.of("MISSION_ITEM")[-1][1]
@@ -232,3 +242,116 @@ def test_arducopter_mission_restarted_in_the_air_stays_level() -> None:
     assert [m.seq for _, m in bench.of("MISSION_ITEM_REACHED")] == [1, 2]
     assert 5.7 < min(heights_m) < max(heights_m) < 6.3
     assert bench.place[0] == pytest.approx(12.0, abs=1.0)
+
+
+@pytest.mark.parametrize("firmware", [PX4, ARDUPILOT])
+def test_a_jump_repeats_a_part_of_the_mission(firmware: Firmware) -> None:
+    """A jump is not reported as reached. A jump to an item that does not exist is skipped."""
+    bench = aloft(firmware=firmware, height_m=5.0)
+    points = [place(WAYPOINT, north, 0, 5, 0, 0, 0, 0) for north in (0, 0, 8)]
+    upload(bench, [*points, act(JUMP, 1, 2), act(JUMP, 99, -1), place(WAYPOINT, 0, 8, 5)])
+    send(bench, mavlink.MAVLink_mission_set_current_message(1, 1, 1))
+    bench.command(300)
+    bench.run_until(lambda: bench.instance.autopilot.mission.finished, 60.0)
+    assert [m.seq for _, m in bench.of("MISSION_ITEM_REACHED")] == [1, 2] * 3 + [5]
+
+
+@pytest.mark.parametrize("firmware", [PX4, ARDUPILOT])
+def test_a_loop_of_jumps_without_a_place_ends(firmware: Firmware) -> None:
+    bench = aloft(firmware=firmware, height_m=5.0)
+    upload(bench, [place(WAYPOINT, 0, 0, 5, 0, 0, 0, 0)] * 2 + [act(SPEED, 1, 2), act(JUMP, 2, -1)])
+    bench.command(300)
+    bench.run(5.0)
+    assert bench.armed
+    assert bench.place == pytest.approx((0, 0, -5), abs=0.5)
+
+
+def test_arducopter_flies_a_spline_circles_and_climbs() -> None:
+    """It circles at 20 deg/s with its nose to the centre, clockwise for a positive radius."""
+    bench = aloft(firmware=ARDUPILOT, height_m=5.0)
+    home = place(WAYPOINT, 0, 0, 0, 0, 0, 0, 0)
+    circle = place(LOITER_TURNS, 10, 4, 5, 1, 0, 4, 0)
+    upload(
+        bench,
+        [
+            home,
+            place(SPLINE, 10, -8, 5, 0, 0, 0, 0),
+            circle,
+            place(TO_ALTITUDE, 10, 0, 9, 0, 0, 0, 0),
+        ],
+    )
+    bench.command(300)
+    reached = bench.instance.autopilot.mission
+    bench.run_until(lambda: reached.reached == 1, 20.0)
+    assert bench.place == pytest.approx((10, -8, -5), abs=2.5)
+    bench.run(8.0)
+    assert math.dist(bench.place[:2], (10, 4)) == pytest.approx(4.0, abs=0.6)
+    north, east = bench.place[0] - 10, bench.place[1] - 4
+    to_centre = math.degrees(math.atan2(-east, -north))
+    assert abs(math.remainder(bench.heading_deg - to_centre, 360.0)) < 15.0
+    bench.run(2.0)
+    turned = math.atan2(bench.place[1] - 4, bench.place[0] - 10) - math.atan2(east, north)
+    assert math.remainder(turned, math.tau) == pytest.approx(math.radians(40.0), abs=0.15)
+    bench.run_until(lambda: reached.finished, 40.0)
+    assert bench.height_m == pytest.approx(9.0, abs=1.2)
+
+
+def test_arducopter_keeps_the_yaw_of_a_condition_until_the_next_place() -> None:
+    bench = aloft(firmware=ARDUPILOT, height_m=5.0)
+    points = [place(WAYPOINT, north, 0, 5, 0, 0, 0, 0) for north in (0, 12, 24)]
+    upload(bench, [points[0], act(YAW, 90, 0, 1, 0), *points[1:]])
+    bench.command(300)
+    bench.run_until(lambda: bench.instance.autopilot.mission.reached == 2, 20.0)
+    assert bench.heading_deg == pytest.approx(90.0, abs=5.0)
+    bench.run_until(lambda: bench.instance.autopilot.mission.reached == 3, 20.0)
+    assert bench.heading_deg == pytest.approx(0.0, abs=8.0)
+
+
+@pytest.mark.parametrize("firmware", [PX4, ARDUPILOT])
+def test_a_mission_faces_a_region_of_interest_until_there_is_none(firmware: Firmware) -> None:
+    bench = aloft(firmware=firmware, height_m=5.0)
+    points = [place(WAYPOINT, north, 0, 5) for north in (0, 9, 18, 36)]
+    region, none = place(REGION, 18, 9, 0, 0, 0, 0, 0), act(NO_REGION)
+    upload(bench, [points[0], region, *points[1:3], none, points[3]])
+    bench.command(300)
+    bench.run_until(lambda: bench.instance.autopilot.mission.reached == 2, 20.0)
+    assert bench.heading_deg == pytest.approx(45.0, abs=15.0)
+    bench.run_until(lambda: bench.instance.autopilot.mission.finished, 30.0)
+    assert bench.heading_deg == pytest.approx(0.0, abs=10.0)
+
+
+def test_arducopter_replaces_a_part_of_its_mission() -> None:
+    """MAVProxy's `wp changealt`, `wp move` and others do so. PX4 has no such message."""
+    bench = aloft(firmware=ARDUPILOT, height_m=5.0)
+    points = [place(WAYPOINT, north, 0, 5) for north in (0, 0, 20, 30)]
+    upload(bench, points)
+    send(bench, mavlink.MAVLink_mission_set_current_message(1, 1, 2))
+    send(bench, mavlink.MAVLink_mission_write_partial_list_message(1, 1, 2, 2))
+    assert asked(bench)[-1] == 2
+    send(bench, item(bench, 2, place(WAYPOINT, 0, 9, 7)))
+    assert acks(bench) == [0, 0]
+    mission = bench.instance.autopilot.mission
+    assert (mission.current, len(mission.items)) == (2, 4)
+    assert [each.z for each in mission.items] == [5, 5, 7, 5]
+    send(bench, mavlink.MAVLink_mission_write_partial_list_message(1, 1, 5, 5))
+    assert acks(bench)[-1] == 1
+
+
+@pytest.mark.parametrize(("firmware", "keeps_present"), [(PX4, False), (ARDUPILOT, True)])
+def test_a_home_that_a_client_sets_is_kept_when_the_vehicle_arms(
+    firmware: Firmware, *, keeps_present: bool
+) -> None:
+    """PX4 does not keep the present position as home, ArduCopter does."""
+    bench = Bench(firmware=firmware, boot_scale=0.1)
+    bench.run(4.5)
+    guidance = bench.instance.autopilot.guidance
+    height_m = firmware.origin[2] + 3.0
+    for params in ((0, 0, 0, 0, *degrees(bench, 12.0, 0.0), height_m), (1,)):
+        assert bench.command(179, *params) == [0]
+        before = guidance.home_ned_m
+        if firmware is ARDUPILOT:
+            assert bench.command(176, 1, 4) == [0]
+        assert bench.command(400, 1) == [0]
+        assert (guidance.home_ned_m == before) is (params[0] == 0 or keeps_present)
+        bench.command(400, 0)
+        bench.run(1.0)
