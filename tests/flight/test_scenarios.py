@@ -507,6 +507,13 @@ ROWS = {
         fly=copter.hop,
         firmware=replace(ARDUPILOT, rules=(NO_TAKEOFF, *ARDUPILOT.rules)),
     ),
+    # it is given longer than 8 s, until it disarms by itself
+    "take-off refused by a helicopter, whose rotor does not turn": ends(
+        "the vehicle disarmed before lift-off; .* command 22 FAILED",
+        stayed_down_without_a_setpoint, fly=copter.hop, believed=HELICOPTER,
+        down=faults.heartbeats(type=4),
+        firmware=replace(ARDUPILOT, rules=(NO_TAKEOFF, *ARDUPILOT.rules)),
+    ),
     "too weak to lift off": ends(
         "no lift-off in 8 s; is hover_thrust in the vehicle file right", disarmed_by_itself,
         fly=px4.hop, boot_scale=1.0,
