@@ -462,6 +462,7 @@ ROWS = {
     ),
     # the MAV_TYPE in HEARTBEAT decides which vehicles are flown
     "a plane": of_type(1, "the vehicle is a FIXED_WING; offboard flies multirotors"),
+    "a standard VTOL": of_type(22, "the vehicle is a VTOL; offboard flies multirotors"),
     "a helicopter": of_type(4, r".*\(airframe: helicopter in its vehicle file flies it\)"),
     "a hexarotor that is no helicopter": of_type(
         13, "the vehicle is a HEXAROTOR; its vehicle file says .*Fix: check .* and airframe in",
