@@ -120,9 +120,13 @@ class Senders:
             self._sequences[key] = frame.sequence
 
     def lost(self, sender: Sender) -> int:
-        """Number of lost frames of a sender: the gaps in its sequence numbers. Components of one
-        system may count their frames together: the smaller of both results is taken."""
-        return min(self._lost[sender.ids], self._lost[sender.ids[:1]])
+        """Number of lost frames of a sender: the gaps in its sequence numbers, without the frames
+        whose id pymavlink does not know (PX4: EVENT). Components of one system may count their
+        frames together: the smaller of both results is taken."""
+        unknown = self.splitter.unknown
+        of_system = sum(count for ids, count in unknown.items() if ids[0] == sender.system_id)
+        own, all_own = self._lost[sender.ids], self._lost[sender.ids[:1]]
+        return max(0, min(own - unknown[sender.ids], all_own - of_system))
 
     @property
     def found(self) -> list[Sender]:

@@ -43,6 +43,7 @@ RESTLESS_S = 5.0
 SETTLED_DISTANCE_M, SETTLED_SPEED_MPS = 0.3, 0.3  # below both, it hovers at the start
 NEAR_M = 0.6  # below this distance, it is near the start
 REST_S = 0.5  # after the end of the reference
+RUN_UP_S = 60.0  # until a helicopter's rotor is up to speed (ArduCopter: H_RSC_RUNUP_TIME, 0 .. 60)
 # Relative error of hover_thrust; a smaller one does not keep a vehicle from reaching the start
 WRONG_THRUST = 0.1
 
@@ -98,6 +99,9 @@ def too_late_at_start(flight: FlightState) -> str:
 
 def no_lift_off(flight: FlightState) -> str:
     after = f"no lift-off in {flight.in_phase_s:.0f} s"
+    if flight.model.airframe == "helicopter":
+        up = flight.in_phase_s <= RUN_UP_S
+        return "" if up else f"{after}; is its rotor up to speed (motor interlock)?"
     if flight.dialect is None or not flight.takes_off_by_command:
         return f"{after}; is hover_thrust in the vehicle file right?"
     return (

@@ -153,7 +153,8 @@ def findings(ground: Ground) -> Iterator[tuple[str, bool, Finding]]:
             yield "parameters", True, Finding(Level.BLOCKS, fault.found, fault.fix, name)
         elif value is None and parameter.must_answer:
             missing = f"no reply for parameter {name}"
-            yield "parameters", False, Finding(Level.BLOCKS, missing, about=name)
+            fix = "check the link; a firmware without this parameter is not flown"
+            yield "parameters", False, Finding(Level.BLOCKS, missing, fix, name)
 
 
 def refusals(ground: Ground) -> list[str]:

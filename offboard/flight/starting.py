@@ -85,10 +85,18 @@ def not_ready(flight: FlightState) -> str:
 PREVENTED = other_sender, mode_unknown, silent, blind  # they prevent a take-over
 
 
+def firmware_unknown(flight: FlightState) -> bool:
+    """Whether a parameter that the firmware must have was not answered. An ArduPlane may show the
+    MAV_TYPE of a multirotor (Q_MAV_TYPE), and the numbers of its modes mean others: 4, GUIDED of
+    ArduCopter, is ACRO."""
+    dialect, known = flight.dialect, flight.vehicle.parameters
+    return dialect is None or any(each.must_answer for each in dialect.unanswered(known))
+
+
 def can_take_over(flight: FlightState) -> bool:
-    """Whether the vehicle is of a fit type and flies in the mode of setpoints without a failsafe,
-    its telemetry is recent, and no other program controls it."""
-    if flight.vehicle.in_failsafe or not engaged_in_the_air(flight):
+    """Whether the vehicle is of a fit type and firmware and flies in the mode of setpoints without
+    a failsafe, its telemetry is recent, and no other program controls it."""
+    if flight.vehicle.in_failsafe or firmware_unknown(flight) or not engaged_in_the_air(flight):
         return False
     return not any(each(flight) for each in (*PREVENTED, unfit_type))
 

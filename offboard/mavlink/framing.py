@@ -8,6 +8,7 @@ length field cannot hide a good frame. Nothing here raises, whatever the input. 
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -63,10 +64,11 @@ class Frame:
 class FrameSplitter:
     """Finds frames. A datagram holds complete frames; the data of a `stream` (serial, TCP) may end
     within a frame, which is kept for the next call. `frames` also counts frames with an unknown id,
-    `bytes_skipped` the bytes outside frames."""
+    which `unknown` has by system and component id, `bytes_skipped` the bytes outside frames."""
 
     def __init__(self, stream: bool) -> None:
         self.bytes_received = self.bytes_skipped = self.frames = 0
+        self.unknown: Counter[tuple[int, int]] = Counter()
         self._stream = stream
         self._rest = b""
         # index in the next data at which the last frame ends; -1: other bytes follow that frame
@@ -94,6 +96,8 @@ class FrameSplitter:
             self.frames += 1
             if frame.verified:
                 frames.append(frame)
+            else:
+                self.unknown[frame.system_id, frame.component_id] += 1
             behind = stop
             at = self._next_marker(data, behind)
         self._rest, self._behind = data[at:], 0 if at == behind or not self._stream else -1

@@ -325,6 +325,7 @@ def unfit_type(vehicle_type: int, *, helicopter: bool) -> str:
         return ""
     known = enums["MAV_TYPE"].get(vehicle_type)
     name = known.name.removeprefix("MAV_TYPE_") if known else f"MAV_TYPE {vehicle_type}"
+    name = "VTOL" if name.startswith("VTOL") else name  # pymavlink has old names: VTOL_RESERVED2
     if helicopter:
         return f"the vehicle is a {name}; its vehicle file says airframe: helicopter"
     hint = " (airframe: helicopter in its vehicle file flies it)"

@@ -42,8 +42,9 @@ class _Demand:
     of_path: bool = False  # depends on the path alone, not on the vehicle
 
 
-def check(reference: Reference, vehicle: Vehicle) -> Envelope:
-    """Check that a vehicle can fly a reference without wind, and return its envelope.
+def check(reference: Reference, vehicle: Vehicle, slower: str = "") -> Envelope:
+    """Check that a vehicle can fly a reference without wind, and return its envelope. `slower` says
+    how the reference becomes slower; it ends the error for a limit of the vehicle.
 
     The reference, relative to the take-off point, is sampled every 10 ms. Raises ValueError for a
     path that is too low or too far away, otherwise for the limit that is exceeded first. Times in
@@ -52,11 +53,11 @@ def check(reference: Reference, vehicle: Vehicle) -> Envelope:
     count = int(np.ceil(reference.duration_s / _STEP_S)) + 1
     times = np.linspace(0.0, reference.duration_s, count)
     parts = [times[first : first + _CHUNK] for first in range(0, count, _CHUNK)]
-    reached = np.max([_envelope(reference, vehicle, part) for part in parts], axis=0)
+    reached = np.max([_envelope(reference, vehicle, slower, part) for part in parts], axis=0)
     return Envelope(*reached.tolist())
 
 
-def _envelope(reference: Reference, vehicle: Vehicle, times: Array) -> Envelope:
+def _envelope(reference: Reference, vehicle: Vehicle, slower: str, times: Array) -> Envelope:
     sample = reference.sample(times)
     state = flat_state(sample, vehicle.gravity_mps2, vehicle.drag_per_mass_ps)
     tilt = np.arccos(np.clip(state.thrust_direction_ned[:, 2], -1.0, 1.0))
@@ -73,10 +74,12 @@ def _envelope(reference: Reference, vehicle: Vehicle, times: Array) -> Envelope:
         if isinstance(reference, Track):
             worst_s, first_s = map(reference.path_time_s, (worst_s, first_s))
         side = "below" if demand.sign < 0.0 else "beyond"
+        fix = f"; {slower}" if slower and not demand.of_path else ""
+        fix += " or turn less (course)" if fix and demand.what == "a yaw rate of" else ""
         raise ValueError(
             f"the reference requires {demand.what} {demand.values[worst]:.3g} {demand.unit} at "
             f"{worst_s:.2f} s, {side} the limit of {demand.limit:.3g} {demand.unit} "
-            f"(first at {first_s:.2f} s)"
+            f"(first at {first_s:.2f} s){fix}"
         )
     north, east, down = sample.position_ned_m.T
     return Envelope(float(tilt.max()), float(-down.min()), float(np.hypot(north, east).max()))

@@ -11,7 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,8 @@ class Shape(Parameters, ABC):
     run_in_s: Seconds = 4.0
     run_out_s: Seconds = 3.0
 
+    pace: ClassVar[str] = "period_s"  # the settings that make the path slower
+
     @abstractmethod
     def path(self) -> Path:
         """Return the path at full speed, NED relative to the origin.
@@ -85,6 +87,11 @@ class Shape(Parameters, ABC):
         """Name of the reference in errors."""
         return self.shape
 
+    @property
+    def slower(self) -> str:
+        """What to change if it is too fast for a vehicle."""
+        return f"fly it slower ({self.pace}; its ends: run_in_s, run_out_s)"
+
 
 class Hover(Shape):
     """At rest at the origin."""
@@ -107,6 +114,8 @@ class Line(Shape):
     to_east_m: Coordinate = 0.0
     climb_m: Annotated[float, Field(ge=-500, le=500)] = 0.0
     speed_mps: Speed = 1.5
+
+    pace: ClassVar[str] = "speed_mps"
 
     def path(self) -> Path:
         displacement = (self.to_north_m, self.to_east_m, -self.climb_m)
@@ -219,6 +228,8 @@ class Waypoints(Shape):
     run_in_s: Seconds = 1.0
     run_out_s: Seconds = 1.0
 
+    pace: ClassVar[str] = "speed_mps, times_s or the limits of fastest"
+
     @model_validator(mode="after")
     def _makes_a_path(self) -> Self:
         if [self.speed_mps, self.times_s, self.fastest].count(None) != 2:
@@ -256,6 +267,8 @@ class FromTable(Shape):
     course: Literal["table", "fixed", "along_velocity"] = "table"  # type: ignore[assignment]
     run_in_s: Seconds = 2.0
     run_out_s: Seconds = 2.0
+
+    pace: ClassVar[str] = "time_s of its rows, or knot_spacing_s=0.5 if they are noisy"
 
     @property
     def title(self) -> str:

@@ -114,7 +114,7 @@ def build_track(config: FlightConfig) -> Track:
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # a value that overflows exceeds a limit
             track = config.reference.track()
-            _, height_m, radius_m = check(track, vehicle)
+            _, height_m, radius_m = check(track, vehicle, config.reference.slower)
     except ValueError as error:
         raise DocumentError(f"reference {config.reference.title}: {error}") from None
     least_s = PERIODS_LEAST * config.period_s

@@ -462,6 +462,7 @@ ROWS = {
     ),
     # the MAV_TYPE in HEARTBEAT decides which vehicles are flown
     "a plane": of_type(1, "the vehicle is a FIXED_WING; offboard flies multirotors"),
+    "a standard VTOL": of_type(22, "the vehicle is a VTOL; offboard flies multirotors"),
     "a helicopter": of_type(4, r".*\(airframe: helicopter in its vehicle file flies it\)"),
     "a hexarotor that is no helicopter": of_type(
         13, "the vehicle is a HEXAROTOR; its vehicle file says .*Fix: check .* and airframe in",
@@ -505,6 +506,13 @@ ROWS = {
     "take-off refused": ends(
         ".*no lift-off in 8 s by the .* is MOT_THST_HOVER right", stayed_down_without_a_setpoint,
         fly=copter.hop,
+        firmware=replace(ARDUPILOT, rules=(NO_TAKEOFF, *ARDUPILOT.rules)),
+    ),
+    # it is given longer than 8 s, until it disarms by itself
+    "take-off refused by a helicopter, whose rotor does not turn": ends(
+        "the vehicle disarmed before lift-off; .* command 22 FAILED",
+        stayed_down_without_a_setpoint, fly=copter.hop, believed=HELICOPTER,
+        down=faults.heartbeats(type=4),
         firmware=replace(ARDUPILOT, rules=(NO_TAKEOFF, *ARDUPILOT.rules)),
     ),
     "too weak to lift off": ends(

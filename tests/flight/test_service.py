@@ -10,6 +10,7 @@ from contextlib import suppress
 from itertools import chain, repeat
 from typing import Any
 
+import faults
 import numpy as np
 import pytest
 from pair import STEP_S, another_vehicle, decode
@@ -615,6 +616,23 @@ def test_parameters_and_uid_are_read_again_after_a_silence(served: Served) -> No
     pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
     assert said(pair, "another vehicle answers")
     assert pair.state.vehicle.uid == 1
+
+
+def test_vehicle_without_copter_parameters_is_left_alone(served: Served) -> None:
+    """Regression: an ArduPlane with Q_MAV_TYPE 2 says that it is a quadrotor. Its pilot switched to
+    ACRO, whose number is that of GUIDED, and BRAKE was requested, whose number is QSTABILIZE."""
+    pair = served.engaged("ardupilot")
+    pair.switch("pilot")
+    pair.run(2.0)
+    unanswered = faults.without(faults.PARAM_VALUE)
+    pair.down = lambda time_s, datagrams: unanswered(time_s, pair.deliver(time_s, datagrams))
+    silence(pair, 8.0)  # then parameters are read again
+    asked = len(pair.modes)
+    pair.switch("engage")
+    pair.run(4.0)
+    assert (pair.phase, pair.mode) == (Phase.HEALTH, "GUIDED")
+    assert len(pair.modes) == asked
+    assert said(pair, "waiting: no reply for parameter GUID_OPTIONS. Fix: check the link")
 
 
 def test_request_just_before_a_phase_change_is_obeyed(served: Served) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from offboard.documents.errors import DocumentError
 from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample
@@ -20,6 +21,7 @@ from offboard.reference.feasibility import check
 from offboard.reference.flatness import FlatState, body_rates, flat_state
 from offboard.reference.shapes import SHAPES
 from offboard.reference.track import Track, hold
+from offboard.run.configuration import build_track, load
 
 Array = NDArray[np.float64]
 
@@ -161,6 +163,25 @@ def test_infeasible_reference_is_refused_with_time_value_and_limit(
     found = re.match(rf"the reference requires {what} (-?[\d.e+]+) \S+ at ([\d.]+) s, ", sentence)
     assert found, sentence
     assert 0.0 < float(found[2]) <= flown.duration_s + 0.005
+
+
+@pytest.mark.parametrize(
+    ("assignments", "end"),
+    [
+        (["reference=circle", "reference.period_s=3"], "(period_s; its ends: run_in_s, run_out_s)"),
+        (["reference=racing", "reference.fastest.tilt_deg=50"], "run_out_s)"),
+        (["reference=lemniscate_course", "reference.half_width_m=0.06"], " or turn less (course)"),
+        (["reference=helix", "reference.climb_mps=-0.4"], " s)"),  # the height needs no speed
+    ],
+)
+def test_refusal_of_a_fast_reference_says_what_makes_it_slower(
+    assignments: list[str], end: str
+) -> None:
+    with pytest.raises(DocumentError) as caught:
+        build_track(load("flight", assignments=assignments))
+    sentence = str(caught.value)
+    assert sentence.endswith(end), sentence
+    assert ("; fly it slower (" in sentence) is (end != " s)")
 
 
 @dataclass
