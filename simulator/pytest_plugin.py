@@ -25,6 +25,18 @@ import pytest
 STOP_S = 2.0
 OPTIONS = ("scenario", "firmware", "vehicle", "seed", "speed")  # names in marker and command
 LOGS = pytest.StashKey[list[Path]]()
+# `python -m simulator`, which also ends with its standard input: with pytest, if that crashes
+PROGRAM = """
+import os, signal, threading
+from simulator.cli import main
+
+def follow():
+    os.read(0, 1)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+threading.Thread(target=follow, daemon=True).start()
+main()
+"""
 
 
 class Sitl:
@@ -42,7 +54,7 @@ class Sitl:
         self.port, self.ground_port = free_ports(2)
         self.log = directory / "sitl.tlog"
         self.output = directory / "sitl.txt"
-        command = [sys.executable, "-P", "-m", "simulator", "--log", str(self.log)]
+        command = [sys.executable, "-P", "-c", PROGRAM, "--log", str(self.log)]
         command += ["--connect", f"udpout:127.0.0.1:{self.port}"]
         command += ["--gcs", f"udpout:127.0.0.1:{self.ground_port}"]
         for name, value in options.items():
@@ -50,7 +62,7 @@ class Sitl:
         with self.output.open("wb") as errors:
             self.process = subprocess.Popen(
                 command,
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 start_new_session=True,  # Ctrl-C reaches pytest only
@@ -92,8 +104,9 @@ class Sitl:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
-        assert self.process.stdout is not None
-        self.process.stdout.close()
+        for pipe in (self.process.stdin, self.process.stdout):
+            assert pipe is not None
+            pipe.close()
 
 
 @pytest.fixture

@@ -212,9 +212,11 @@ class _Collector:
         return dialect_of(entry.message) is not self._dialect
 
     def _keep(self, samples: Samples | None, payload: bytes, unix_s: float) -> None:
-        """Add a message; one without a time stamp has the vehicle time of the telemetry before."""
+        """Add a message; one without a time stamp has the vehicle time of the telemetry before. So
+        has a setpoint of another program, whose `time_boot_ms` is that of its own clock."""
         if samples:
-            stamp_ms = samples.stamp_ms(payload)
+            foreign = samples is self._ours["SET_ATTITUDE_TARGET"] and not self._event_records
+            stamp_ms = None if foreign else samples.stamp_ms(payload)
             time_s = self.now_s if stamp_ms is None else self._continued_s(stamp_ms)
             samples.add(payload, time_s, unix_s)
 

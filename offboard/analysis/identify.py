@@ -1,7 +1,8 @@
 """Identifies the vehicle of a log and the noise of its estimator, and writes the vehicle file.
 
 The flight may be that of another program, if it sent SET_ATTITUDE_TARGET with the vehicle's system
-id and component id 191, as `offboard` does.
+id and component id 191, as `offboard` does. The time at which it sent one is that of the telemetry
+before it in the log.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ _KEYS = {"drag_ps": "drag_translation_npmps"}  # constant -> another key in a ve
 _REASONS = {"thrust_delay_s": "thrust_lag_s"}  # both are identified together, or neither is
 DIGITS = 6  # significant digits of the values in a vehicle file
 LINE_WIDTH = 80
+IN_AIR = 2  # MAV_LANDED_STATE_IN_AIR
 MEAN_OVER_S = 0.5  # time over which reported velocity and position are compared
 
 
@@ -50,7 +52,7 @@ def identify_flight(history: History, vehicle: Vehicle) -> tuple[Identified, Tra
 
 
 def _trace(history: History) -> Trace:
-    """Return the airborne part of a log; the whole log if it has no phases of `offboard`."""
+    """Return the part of a log in which the vehicle flew by setpoints."""
     setpoint, attitude = history.setpoint, history.attitude
     position = history.position
     commanded = thrust_direction_from_quaternion(setpoint["quaternion"])
@@ -72,9 +74,26 @@ def _trace(history: History) -> Trace:
 
 
 def _flown(history: History) -> tuple[float, float]:
+    """Return when the phases of `offboard` with setpoints in the air began and ended. In a log of
+    another program it is the longest time in OFFBOARD or GUIDED between the first and the last
+    setpoint, and in the air according to the land detector."""
     indices = [phase.code for phase in TRACKING]
     times = history.records["time_s"][np.isin(history.records["phase"], indices)]
-    return (times[0] + LIFTED_OFF_S, times[-1]) if len(times) else (-math.inf, math.inf)
+    if len(times):
+        return times[0] + LIFTED_OFF_S, times[-1]
+    sent = history.setpoint["time_s"]
+    if not (len(sent) and history.dialect and history.modes):
+        return -math.inf, math.inf
+    air = history.landed["time_s"][history.landed["state"] == IN_AIR]
+    first_s, last_s = (air[0] + LIFTED_OFF_S, air[-1]) if len(air) else (sent[0], sent[-1])
+    first_s, last_s = np.fmax(first_s, sent[0]), np.fmin(last_s, sent[-1])
+    ends = [*(mode.time_s for mode in history.modes[1:]), math.inf]
+    spans = [
+        (float(np.fmax(mode.time_s, first_s)), float(np.fmin(end_s, last_s)))
+        for mode, end_s in zip(history.modes, ends, strict=True)
+        if mode.what == history.dialect.engage_mode
+    ]
+    return max(spans, key=lambda span: span[1] - span[0], default=(math.inf, -math.inf))
 
 
 def constants(found: Identified) -> dict[str, list[Row]]:

@@ -2,8 +2,8 @@
 
 An entry is a big-endian uint64 of Unix microseconds, then one unchanged MAVLink frame. If the log
 ends inside an entry (after a crash), the entries before are read. Damaged entries are skipped and
-counted: reading continues where a time stamp is followed by a frame with a correct checksum. A file
-without any entry is refused.
+counted: reading continues where a time stamp is followed by a frame with a correct checksum and by
+another entry. A file without any entry is refused.
 """
 
 from __future__ import annotations
@@ -129,14 +129,15 @@ class Tlog:
 def _entry(data: bytes, at: int, *, certain: bool) -> LoggedMessage | None:
     """Return the entry at `at`, None if there is none.
 
-    `certain`: whether the checksum must be verified. If not, a message that pymavlink does not know
-    is accepted if another entry follows.
+    A correct checksum or another entry after it is enough, so that a message that pymavlink does
+    not know is accepted. `certain`: both are needed, so that no frame of a file without time stamps
+    (MAVProxy's .tlog.raw) is taken for an entry.
     """
     end = _end(data, at)
     if not _begins(data, at) or end > len(data):
         return None
     frame = parse(data, at + 8, end)
-    if frame is None or not (frame.verified or (_begins(data, end) and not certain)):
+    if frame is None or not (all if certain else any)((frame.verified, _begins(data, end))):
         return None
     return LoggedMessage(_STAMP.unpack_from(data, at)[0], frame)
 

@@ -255,6 +255,8 @@ def _loaded(text: str, source: str) -> Any:
         mark = getattr(error, "problem_mark", None)
         place = _place(mark) if mark else source
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
+        if problem.startswith("but "):  # the second half of a sentence
+            problem = f"{getattr(error, 'context', '')}, {problem}"
         wrong = isinstance(error, yaml.scanner.ScannerError | yaml.parser.ParserError)
         hint = "; check indentation, colons and quotes" if wrong else ""
         raise DocumentError(f"{place}: {problem}{hint}") from None

@@ -7,6 +7,7 @@ import random
 import re
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,9 @@ from pair import Pair, in_phase, make, on_arducopter
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from watch import scenario_of, watched
 
+from offboard.analysis.history import gather
 from offboard.analysis.identify import identify_flight, vehicle_file
+from offboard.analysis.tlog import read
 from offboard.documents.reading import parse
 from offboard.flight.estimates import HoverEstimate
 from offboard.flight.phases import FLYING, Phase
@@ -32,6 +35,7 @@ from simulator.vehicle.attitude import build_loop
 IDENTIFY = IdentifySettings()
 NEUTRAL = simulated.vehicle("neutral")
 TRUE = simulated.vehicle("px4_sih")
+RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
 FIVE_S, ONE_LAP = "reference.duration_s=5.0", "reference.laps=1"
 QUICK = {"delay_s": 0.03, "natural_frequency_radps": 8.0, "damping": 0.5}
 SLUGGISH = {"delay_s": 0.04, "natural_frequency_radps": 3.5, "damping": 1.05}
@@ -100,6 +104,16 @@ def test_unknown_vehicle_is_identified_in_flight_and_from_its_log(true: Vehicle)
     written = parse(vehicle_file(found, NEUTRAL, "a flight"), Vehicle, "vehicle.yaml")
     assert written.tilt.damping == pytest.approx(values["tilt_damping"], abs=1e-3)
     assert written.hover_thrust == pytest.approx(values["hover_thrust"], abs=1e-4)
+
+
+def test_vehicle_is_identified_from_a_log_of_another_program() -> None:
+    """A recording of PX4's SIH (mass 1 kg, drag SIH_KDV 1 N per m/s). The program's time stamps
+    were 0.19 s behind the vehicle's clock; the vehicle also stood, landed and was in POSCTL."""
+    found, _ = identify_flight(gather(read(RECORDING)), NEUTRAL)
+    values = {name: each.value for name, each in found.estimates.items() if each is not None}
+    assert values["tilt_delay_s"] == pytest.approx(0.057, abs=0.01)  # as on flights of `offboard`
+    assert values["yaw_delay_s"] == pytest.approx(0.16, abs=0.02)
+    assert values["drag_ps"] == pytest.approx(1.0, abs=0.08)
 
 
 @pytest.mark.slow

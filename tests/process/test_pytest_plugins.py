@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -95,6 +96,26 @@ def test_pytest_fixtures_work_as_in_the_readme(workers: int, pytester: pytest.Py
         "*pytest.mark.sitl: name the option 'wind_2mps'; there is scenario, firmware*",
     ):
         result.stdout.fnmatch_lines(line)
+
+
+def test_vehicle_ends_with_a_pytest_that_crashes(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        """
+        import os, pathlib
+
+        def test_crashes(sitl):
+            pathlib.Path("pid").write_text(str(sitl.process.pid))
+            os._exit(9)
+        """
+    )
+    assert pytester.runpytest_subprocess("-q", timeout=60).ret == 9
+    vehicle = int((pytester.path / "pid").read_text())
+    ended_by_s = time.monotonic() + 20.0
+    with suppress(ProcessLookupError):
+        while time.monotonic() < ended_by_s:
+            os.kill(vehicle, 0)
+            time.sleep(0.01)
+        pytest.fail("the vehicle still runs")
 
 
 def test_ctrl_c_in_a_flight_ends_pytest(fly: Callable[..., Flight], tmp_path: Path) -> None:

@@ -135,7 +135,11 @@ KEYS = "circles, colour, corner, corners, named, scale, shape, tilt_rad, title, 
             "line 1, column 8: aliases and tags are not allowed",
         ),
         ("? [1, 2]\n: 3", "line 1, column 3: a key must be a single word"),
-        ("a: 1\n---\nb: 2", "line 2, column 1: but found another document"),
+        (
+            "a: 1\n---\nb: 2",
+            "line 2, column 1: expected a single document in the stream, "
+            "but found another document",
+        ),
         ("[" * 1000, "d.yaml: nested too deeply"),
     ],
 )

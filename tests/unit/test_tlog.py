@@ -14,6 +14,7 @@ import pytest
 from pymavlink import mavutil
 
 from offboard.analysis import history, tlog
+from offboard.documents.errors import UserError
 from offboard.link.log import entry as written
 
 RECORDINGS = Path(__file__).parents[1] / "wire" / "recordings"
@@ -129,3 +130,12 @@ def test_texts_and_refusals_get_the_vehicle_time() -> None:
             expected.append((now_s, f"command {message.command} refused, result {message.result}"))
     assert len(expected) > 5
     assert [(sent.time_s, sent.what) for sent in flown.vehicle_messages] == expected
+
+
+def test_frames_without_time_stamps_are_no_log(tmp_path: Path) -> None:
+    """MAVProxy writes such a file beside its log: mav.tlog.raw. Bytes of a frame may look like a
+    time stamp before the next frame."""
+    raw = tmp_path / "mav.tlog.raw"
+    raw.write_bytes(b"".join(m.frame.raw for m in tlog.read(PX4)))
+    with pytest.raises(UserError, match=r"not a \.tlog: it has no time stamp"):
+        tlog.read(raw)
