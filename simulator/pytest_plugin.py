@@ -25,18 +25,8 @@ import pytest
 STOP_S = 2.0
 OPTIONS = ("scenario", "firmware", "vehicle", "seed", "speed")  # names in marker and command
 LOGS = pytest.StashKey[list[Path]]()
-# `python -m simulator`, which also ends with its standard input: with pytest, if that crashes
-PROGRAM = """
-import os, signal, threading
-from simulator.cli import main
-
-def follow():
-    os.read(0, 1)
-    os.kill(os.getpid(), signal.SIGTERM)
-
-threading.Thread(target=follow, daemon=True).start()
-main()
-"""
+# the `simulator` command, which also ends if pytest crashes
+PROGRAM = "from simulator.cli import main_until_input_ends; main_until_input_ends()"
 
 
 class Sitl:

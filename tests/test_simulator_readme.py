@@ -102,7 +102,7 @@ def unknown(firmware: Firmware, rule: Rule) -> Iterator[str]:
 
 
 def exists(firmware: Firmware, condition: str) -> bool:
-    name, compares, value = condition.partition("=")
+    name, compares, value = condition.replace("&", "=").partition("=")
     if compares:
         known = any(name == spec.name for spec in firmware.parameters)
         return known and all(map(str.isdecimal, value.split(",")))

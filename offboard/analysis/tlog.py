@@ -137,7 +137,10 @@ def _entry(data: bytes, at: int, *, certain: bool) -> LoggedMessage | None:
     if not _begins(data, at) or end > len(data):
         return None
     frame = parse(data, at + 8, end)
-    if frame is None or not (all if certain else any)((frame.verified, _begins(data, end))):
+    if frame is None:
+        return None
+    followed = _begins(data, end)
+    if not (frame.verified and followed if certain else frame.verified or followed):
         return None
     return LoggedMessage(_STAMP.unpack_from(data, at)[0], frame)
 

@@ -117,9 +117,8 @@ class FlightState(Ground):
     outcome: Outcome | None = None
 
     busyness: Busyness = field(init=False)  # of this computer
-    telemetry_host_s: float = (
-        math.nan
-    )  # host time of the turn in which the newest telemetry arrived
+    # host time of the turn in which the newest telemetry arrived
+    telemetry_host_s: float = math.nan
     telemetry_arrived_s: float = 0.0  # monotonic host time of that arrival, in lockstep too
     # `clock.answered_s` at the newest report of the mode: the vehicle had received what was sent
     # until then when it sent this report

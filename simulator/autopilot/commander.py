@@ -174,6 +174,9 @@ class Commander:
         name, compares, value = condition.partition("=")
         if compares:
             return self._parameters[name] in map(float, value.split(","))
+        name, masks, value = condition.partition("&")
+        if masks:
+            return bool(int(self._parameters[name]) & int(value))
         return CONDITIONS[condition](self)
 
     def _apply(self, rule: Rule, target: str) -> None:

@@ -70,9 +70,9 @@ class Rule:
         event: name of the event; `Firmware.boot_events_s` has the events of the start.
         mode: names of the modes in which the row applies, separated by spaces; "*": any mode.
         when: conditions that must all hold (`simulator.autopilot.commander.CONDITIONS`). "not X"
-            negates X. "NAME=1,2" holds if parameter NAME is 1 or 2, "since X" in a failsafe that
-            event X caused, "reached X" after boot event X, "latched X" after event X until a
-            reboot, "requests X" if mode X is requested.
+            negates X. "NAME=1,2" holds if parameter NAME is 1 or 2, "NAME&4" if its bit 4 is set,
+            "since X" in a failsafe that event X caused, "reached X" after boot event X, "latched X"
+            after event X until a reboot, "requests X" if mode X is requested.
         to: name of the next mode; "*": no change; "requested": the mode that the command names;
             "remembered": the last chosen mode with `Mode.remembered`; `ByParameter`: the row fits
             only its values.

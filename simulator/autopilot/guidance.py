@@ -97,9 +97,8 @@ class Guidance:
         self.home_yaw_rad = 0.0
         self.home_kept = False  # whether a client set home, which is then kept when it arms
         self.cruise_mps = math.inf  # speed requested for automatic flight; inf: none
-        self.region_ned_m: tuple[float, float] | None = (
-            None  # region of interest, faced until the next setpoint
-        )
+        # region of interest, faced until the next setpoint
+        self.region_ned_m: tuple[float, float] | None = None
         self._behaviours = behaviours
         self.behaviour = Behaviour.HOLD
         self.active = behaviours[Behaviour.HOLD](self)

@@ -41,13 +41,16 @@ class Sticks:
                 self._overridden.pop(channel, None)
             elif pulse_us != KEEP:
                 if channel < _STICKS:
-                    before_us, before_s = self._overridden.get(channel, (pulse_us, -math.inf))
-                    passed_s = max(_PERIOD_MIN_S, now_s - before_s)
-                    speed_ps = (pulse_us - before_us) / _RANGE_US / passed_s
-                    share = passed_s / (passed_s + _SPEED_FILTER_S) if passed_s < 1.0 else 1.0
-                    self._speeds_ps[channel] += share * (speed_ps - self._speeds_ps[channel])
+                    self._measure_speed(channel, pulse_us, now_s)
                 self._overridden[channel] = (pulse_us, now_s)
         return any(abs(speed_ps) > _MOVED_PS for speed_ps in self._speeds_ps)
+
+    def _measure_speed(self, channel: int, pulse_us: int, now_s: float) -> None:
+        before_us, before_s = self._overridden.get(channel, (pulse_us, now_s))
+        passed_s = max(_PERIOD_MIN_S, now_s - before_s)
+        speed_ps = (pulse_us - before_us) / _RANGE_US / passed_s
+        share = passed_s / (passed_s + _SPEED_FILTER_S)
+        self._speeds_ps[channel] += share * (speed_ps - self._speeds_ps[channel])
 
     def pulses_us(self, now_s: float) -> tuple[int, ...]:
         """Return the pulse widths of all channels."""

@@ -290,11 +290,6 @@ def _delayed(event: str, parameter: str, modes: Mapping[int, str]) -> tuple[Rule
     )
 
 
-def _with_bit(parameter: str, bit: int) -> str:
-    """The condition that this bit of a parameter is set."""
-    return f"{parameter}={','.join(str(value) for value in range(32) if value >> bit & 1)}"
-
-
 def _says(
     event: str,
     text: StatusText,
@@ -363,29 +358,28 @@ RULES = (
     Rule("battery low", when=("armed",), texts=(_WARNINGS["battery low"], _LOST)),
     *(Rule(event, texts=(text,)) for event, text in _WARNINGS.items()),
     Rule("ground station found", texts=(_REGAINED,)),
-    Rule("sticks lost", "AUTO.MISSION", when=(_with_bit("COM_RCL_EXCEPT", 0),)),
-    Rule("sticks lost", "AUTO.LOITER AUTO.TAKEOFF", when=(_with_bit("COM_RCL_EXCEPT", 1),)),
-    Rule("sticks lost", "OFFBOARD", when=(_with_bit("COM_RCL_EXCEPT", 2),)),
+    Rule("sticks lost", "AUTO.MISSION", when=("COM_RCL_EXCEPT&1",)),
+    Rule("sticks lost", "AUTO.LOITER AUTO.TAKEOFF", when=("COM_RCL_EXCEPT&2",)),
+    Rule("sticks lost", "OFFBOARD", when=("COM_RCL_EXCEPT&4",)),
     *_delayed("sticks lost", "NAV_RCL_ACT", {2: _RTL, 3: _LAND}),
     Rule(
         "sticks lost",
-        when=("armed", "NAV_RCL_ACT=1"),
+        when=("armed", "not landed", "NAV_RCL_ACT=1"),
         to="AUTO.LOITER",
         do=("failsafe",),
         texts=(_LOST,),
     ),
-    Rule("sticks moved", when=("not armed",)),
     Rule(
         "sticks moved",
-        "OFFBOARD",
-        when=(_with_bit("COM_RC_OVERRIDE", 1),),
+        _AUTOMATIC,
+        when=("armed", "COM_RC_OVERRIDE&1"),
         to="POSCTL",
         texts=(_TAKEN,),
     ),
     Rule(
         "sticks moved",
-        _AUTOMATIC,
-        when=(_with_bit("COM_RC_OVERRIDE", 0),),
+        "OFFBOARD",
+        when=("armed", "COM_RC_OVERRIDE&2"),
         to="POSCTL",
         texts=(_TAKEN,),
     ),
