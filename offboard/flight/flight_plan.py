@@ -64,7 +64,8 @@ class FlightPlan:
     def start_climb(
         self, time_s: float, position_ned_m: Array, velocity_ned_mps: Array, heading_rad: float
     ) -> None:
-        """Fly from this position and velocity (3,) to rest at the start of the track."""
+        """Fly from this position and velocity (3,) to rest at the start of the track, along a flat
+        way at the greater of the two heights."""
         start = Moved(self.track, origin_ned_m=self.origin_ned_m).sample(0.0)
         climb = transfer(
             position_ned_m,
@@ -72,6 +73,7 @@ class FlightPlan:
             heading_rad,
             float(start.heading_rad),
             start_velocity_ned_mps=velocity_ned_mps,
+            keeps_height=True,
         )
         self._arrival_s = time_s + climb.duration_s
         self._planned, self._tracks = Moved(climb, time_s), False

@@ -25,6 +25,7 @@ _RAMPS_SHARE = 0.6  # greatest share of the distance for acceleration and brakin
 _SMOOTH_PEAK = 35.0 / 16.0  # greatest slope of the smoothstep of degree 7
 _BRAKE_MIN_S = 1.5
 _CREEP_MPS = 0.5  # up to this speed a start needs no braking
+_LOW_M = 0.5  # a way between heights that differ by less is straight
 _AHEAD = 0.7  # least cosine between the start's velocity and the direction of the target
 
 
@@ -61,6 +62,7 @@ def transfer(
     limits: Limits = Limits(),
     *,
     start_velocity_ned_mps: Vector = (0.0, 0.0, 0.0),
+    keeps_height: bool = False,
 ) -> Track:
     """Return the flight from a start (3,), NED, to rest at a target (3,), about as fast as the
     limits allow.
@@ -69,7 +71,9 @@ def transfer(
     turns that is nearest to the start. If the start is too fast, or does not move towards the
     target, the vehicle first brakes to rest in the direction of its motion (the ground is not
     considered). A long transfer is straight, at constant speed between acceleration and braking.
-    Raises ValueError if any argument is not finite.
+    With `keeps_height`, a way flatter than 45 degrees is flown level at the greater of the two
+    heights: the vehicle climbs before it, or descends after it. Raises ValueError if any argument
+    is not finite.
     """
     start, target, velocity = (
         np.asarray(list(vector), dtype=np.float64)
@@ -82,33 +86,48 @@ def transfer(
     end[0] = *target, start_heading_rad + turn_rad
     if not (np.all(np.isfinite(begin)) and np.all(np.isfinite(end))):
         raise ValueError("a transfer needs a finite start and a finite target")
-    if _moves_well(begin, end, limits):
-        hop = _shortest(begin, end, limits)
-        if hop.length_s <= _CRUISE_FROM_S:
-            return Track(hop)
+    stops = _stops(begin, end) if keeps_height else [end]
     times_s, jets = [0.0], [begin]
-    if velocity.any():
+    if velocity.any() and not _moves_well(begin, stops[0], limits):
         brake_s = max(_brake_s(velocity, limits), _BRAKE_MIN_S)
-        begin = _at_rest(begin[0] + begin[1] * (brake_s / 2.0))
-        times_s, jets = [*times_s, brake_s], [*jets, begin]
+        times_s.append(brake_s)
+        jets.append(_at_rest(begin[0] + begin[1] * (brake_s / 2.0)))
+        stops = _stops(jets[-1], end) if keeps_height else [end]
+    for stop in stops:
+        for leg_s, jet in _legs(jets[-1], stop, limits):
+            times_s.append(times_s[-1] + leg_s)
+            jets.append(jet)
+    return Track(joined(times_s, jets))
+
+
+def _stops(begin: Array, end: Array) -> list[Array]:
+    """Return the ends of the ways at the greater of two heights: `end`, after a corner over the
+    lower one if the straight way is flat and low."""
+    north_m, east_m, down_m = end[0, :3] - begin[0, :3]
+    if abs(down_m) < _LOW_M or math.hypot(north_m, east_m) <= abs(down_m):
+        return [end]
+    lower, higher = (begin, end) if down_m < 0.0 else (end, begin)
+    corner = _at_rest(lower[0])
+    corner[0, 2] = higher[0, 2]
+    return [corner, end]
+
+
+def _legs(begin: Array, end: Array, limits: Limits) -> list[tuple[float, Array]]:
+    """Return duration and end of each leg of a straight way to rest at `end`."""
     hop = _shortest(begin, end, limits)
     if hop.length_s <= _CRUISE_FROM_S:
-        legs = [(hop.length_s, end)]
-    else:
-        legs = _cruise(begin[0], end[0], limits)
-    for leg_s, jet in legs:
-        times_s.append(times_s[-1] + leg_s)
-        jets.append(jet)
-    return Track(joined(times_s, jets))
+        return [(hop.length_s, end)]
+    return _cruise(begin[0], end[0], limits)
 
 
 def _moves_well(begin: Array, end: Array, limits: Limits) -> bool:
     """Whether the start needs no braking: it is slow, or within the speed limit and towards the
-    target."""
+    target, which one polynomial reaches."""
     velocity, way = begin[1, :3], end[0, :3] - begin[0, :3]
     speed_mps = float(np.linalg.norm(velocity))
     ahead = float(velocity @ way) >= _AHEAD * speed_mps * float(np.linalg.norm(way))
-    return speed_mps <= _CREEP_MPS or (ahead and speed_mps <= limits.speed_mps)
+    fits = speed_mps <= _CREEP_MPS or (ahead and speed_mps <= limits.speed_mps)
+    return fits and _shortest(begin, end, limits).length_s <= _CRUISE_FROM_S
 
 
 def _at_rest(place: Array) -> Array:

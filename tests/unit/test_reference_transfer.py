@@ -74,6 +74,32 @@ def test_transfer_from_any_velocity_stays_within_the_limits() -> None:
                     np.testing.assert_allclose(before, after, atol=1e-4)
 
 
+def test_flat_way_is_flown_at_the_greater_height() -> None:
+    """Further than 1 m from either end of a flat way, the vehicle is as high as the higher end,
+    after a lift-off, on the way down, and when it first brakes. A steep way is straight."""
+    cases = (
+        ((0, 0, -0.6), (40, 0, -3), (0, 0, -0.9)),
+        ((0, 0, -20), (9, 30, -3), (0, 0, 0)),
+        ((0, 0, -3), (60, 0, -8), (5, 0, 0)),
+    )
+    for start, target, velocity in cases:
+        flown = transfer(
+            start, target, 0.0, 1.0, start_velocity_ned_mps=velocity, keeps_height=True
+        )
+        places = flown.sample(np.linspace(0.0, flown.duration_s, 4001)).position_ned_m
+        braked_m = velocity[0] * 35.0 / 16.0 * velocity[0] / 2.0 / 2.0
+        from_start_m = np.linalg.norm(places[:, :2] - (start[0] + braked_m, 0.0), axis=1)
+        away = from_start_m > 1.0
+        away &= np.linalg.norm(places[:, :2] - target[:2], axis=1) > 1.0
+        away &= places[:, 0] >= braked_m
+        assert away.any()
+        np.testing.assert_allclose(places[away, 2], min(start[2], target[2]), atol=1e-6)
+        np.testing.assert_allclose(places[-1], target, atol=1e-6)
+    steep = ((0, 0, -1), (4, 0, -6), 0.0, 0.0)
+    way, straight = transfer(*steep, keeps_height=True), transfer(*steep)
+    assert way.duration_s == straight.duration_s
+
+
 def table_track(text: str, **settings: object) -> Track:
     return FromTable(**{"file": "flown.csv", "text": text} | settings).track()
 
