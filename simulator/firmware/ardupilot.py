@@ -44,8 +44,15 @@ _NOT_ENTERED = {
 }
 # MAV_CMDs that are accepted without effect in the simulator, and those that fail because their
 # devices are missing
-_TAKEN = (181, 203, 206, 207, 208, 209, 2001, 5300, 42001, 42003, 42424, 42428)
-_FAILED = (84, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
+_TAKEN = (
+    181, 182, 198, 202, 203, 206, 207, 208, 216, 2001, 2520, 2600, 5300, 42001, 42003, 42006, 42425,
+    42426, 42428, 42651, 43004,
+)  # fmt: skip
+_FAILED = (
+    84, 184, 188, 189, 193, 204, 205, 211, 218, 500, 601, 1000, 1001, 2000, 2500, 2501, 10001,
+    42429, 42600,
+)  # fmt: skip
+_DENIED = (32, 245, 532, 534, 42700)
 
 _CENTI = 0.01
 _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b111, 64, 128  # type_mask
@@ -256,8 +263,7 @@ ARDUPILOT = ArduCopter(
     command_answers={
         **dict.fromkeys(_TAKEN, Result.ACCEPTED),
         **dict.fromkeys(_FAILED, Result.FAILED),
-        245: Result.DENIED,
-        532: Result.DENIED,
+        **dict.fromkeys(_DENIED, Result.DENIED),
     },
     global_frames=frozenset({0, 3, 5, 6, 10, 11}),
     setpoints_as_automatic=True,

@@ -12,7 +12,16 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from simulator.autopilot.firmware import RANGES, ByParameter, ParameterSpec, Role, Rule
-from simulator.autopilot.values import Behaviour, Mode, Result, StatusText, critical, info, warning
+from simulator.autopilot.values import (
+    Behaviour,
+    Mode,
+    Result,
+    Severity,
+    StatusText,
+    critical,
+    info,
+    warning,
+)
 from simulator.geodesy import GRAVITY_MPS2
 
 # MAV_MODE_FLAG: 1 custom mode, 8 guided, 16 stabilise, 64 manual input. "Guided" does not mean the
@@ -302,6 +311,12 @@ def _entries(event: str) -> list[Rule]:
     ]
 
 
+def _not_armed(event: str, text: str) -> Rule:
+    """A row that refuses an armed vehicle."""
+    refusal = StatusText(Severity.NOTICE, text)
+    return Rule(event, when=("armed",), result=_FAILED, texts=(refusal,))
+
+
 RULES = (
     # A mode requested before this event was acknowledged, but is not kept
     Rule("initialised", to="STABILIZE", texts=(info("ArduPilot Ready"),)),
@@ -319,6 +334,14 @@ RULES = (
     Rule("speed", "GUIDED AUTO RTL"),
     Rule("speed", result=_FAILED),
     Rule("servo"),
+    Rule(
+        "motor test",
+        when=("not landed",),
+        result=_FAILED,
+        texts=(critical("Motor Test: vehicle not landed"),),
+    ),
+    _not_armed("calibration", "Disarm to allow calibration"),
+    _not_armed("compass calibration", "Disarm to allow compass calibration"),
     Rule("loiter", when=("not position missing",), to="LOITER", send=_HEARTBEAT),
     Rule("loiter", result=_FAILED),
     *_entries("mission"),

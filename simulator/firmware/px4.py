@@ -42,9 +42,10 @@ _BY_FLAGS = ((4, "AUTO.MISSION"), (64 | 8, "POSCTL"), (64 | 16, "STABILIZED"), (
 _NO_AUTO_MODE = critical("Unsupported auto mode")
 
 # MAV_CMDs that are accepted without effect in the simulator, and those that are not acknowledged
-_TAKEN = (80, 187, 191, 195, 197, 201, 245, 519, 525, 528)
+_TAKEN = (80, 187, 191, 195, 196, 197, 201, 245, 519, 525, 528)
 _UNANSWERED = (
-    1, 93, 203, 204, 205, 206, 214, 220, 242, 243, 260, 310, 420, 500, 521, 530, 531, 532, 3000
+    1, 93, 203, 204, 205, 206, 214, 220, 242, 243, 260, 310, 420, 500, 521, 530, 531, 532, 1000,
+    1001, 2003, 3000, 42600,
 )  # fmt: skip
 
 _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b011, 64, 128  # type_mask
@@ -241,7 +242,6 @@ PX4 = Px4(
         **dict.fromkeys(_TAKEN, Result.ACCEPTED),
         **dict.fromkeys(_UNANSWERED),
         189: Result.CANCELLED,
-        211: Result.DENIED,
         224: Result.UNSUPPORTED,  # clients use the message MISSION_SET_CURRENT
     },
     global_frames=frozenset({5, 6, 11}),

@@ -406,6 +406,10 @@ def test_only_px4_applies_a_climb_speed_to_horizontal_flight(
         ("GUIDED", 510, RELATIVE, (60_000.0, 0.0, 0.0, 0.0), 4),
         ("GUIDED", 178, RELATIVE, (1.0, 3.0, 0.0, 0.0), ACCEPTED),
         ("LOITER", 178, RELATIVE, (1.0, 3.0, 0.0, 0.0), FAILED),
+        ("GUIDED", 209, RELATIVE, (1.0, 0.0, 5.0, 1.0), FAILED),  # motor test in the air
+        ("GUIDED", 241, RELATIVE, (1.0, 0.0, 0.0, 0.0), FAILED),  # calibration while armed
+        ("GUIDED", 42424, RELATIVE, (0.0, 0.0, 1.0, 0.0), FAILED),
+        ("GUIDED", 1000, RELATIVE, (0.0, 0.0, 0.0, 0.0), FAILED),  # no gimbal
     ],
 )
 def test_arducopter_answers_unusual_commands_as_the_real_one(
