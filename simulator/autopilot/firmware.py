@@ -145,6 +145,9 @@ class Firmware(ABC):
     takeoff_items_climb: bool = False  # a takeoff item does not make the vehicle descend
     guided_items: bool = False  # a MISSION_ITEM with current = 2 is a place to fly to at once
     mission_text: StatusText | None = None  # text after an upload
+    # MAV_CMD -> name in the texts about the progress of a mission; without names there are none
+    item_titles: Mapping[int, str] = field(default_factory=dict)
+    disarming_resets_mission: bool = False
     reached_above_landing: bool = False  # "item reached" also when above the place of a landing
     turning_items: frozenset[int] = frozenset()  # MAV_CMDs of items whose param4 is a yaw
 

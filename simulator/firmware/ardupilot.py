@@ -76,6 +76,14 @@ _ACTS = frozenset({
     222, 223, 531, 532, 534, 600, 601, 1000, 2000, 2001, 2500, 2501, 3000, 42600, 42702, 42703,
 })  # fmt: skip
 
+_TITLES = {
+    16: "WP", 17: "LoitUnlim", 18: "LoitTurns", 19: "LoitTime", 20: "RTL", 21: "Land",
+    22: "Takeoff", 31: "LoitAltitude", 82: "SplineWP", 93: "Delay", 112: "CondDelay",
+    114: "CondDist", 115: "CondYaw", 178: "ChangeSpeed", 179: "SetHome", 181: "SetRelay",
+    183: "SetServo", 189: "LandStart", 195: "SetROILocation", 197: "SetROINone", 201: "SetROI",
+    205: "MountControl", 206: "SetCamTrigDst", 207: "FenceEnable", 211: "Gripper",
+}  # fmt: skip
+
 _RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
 
 
@@ -273,6 +281,8 @@ ARDUPILOT = ArduCopter(
     takeoff_items_climb=True,
     guided_items=True,
     mission_text=info("Flight plan received"),
+    item_titles=_TITLES,
+    disarming_resets_mission=True,
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=telemetry,

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from offboard.model.frames import euler_from_quaternion
+from simulator.autopilot.mission import Kind
 from simulator.autopilot.values import AttitudeSetpoint
 from simulator.firmware.ardupilot_tables import BY_HAND, BY_POSITION
 from simulator.geodesy import GRAVITY_MPS2
@@ -130,13 +131,16 @@ _NO_MISSION, _NOT_STARTED, _ACTIVE, _PAUSED, _COMPLETE = range(1, 6)  # MISSION_
 
 
 def mission_current(view: View) -> Sequence[Any]:
-    """The number of items is without home; before the start, the current item is home (0)."""
-    mission = view.autopilot.mission
+    """The number of items is without home; before the start, the current item is home (0). A
+    return is part of the mission, in mode AUTO."""
+    mission, in_auto = view.autopilot.mission, view.autopilot.commander.mode.name == "AUTO"
     begun = mission.under_way or mission.reached >= 0 or mission.current > mission.first
     state = _NO_MISSION
     if mission.flyable:
         state = _PAUSED if begun else _NOT_STARTED
         state = _ACTIVE if mission.under_way else state
-        state = _COMPLETE if mission.finished else state
+        if mission.finished:
+            returns = in_auto and mission.items[mission.current].command == Kind.RETURN
+            state = _ACTIVE if returns else _COMPLETE
     number = mission.current if begun else 0
-    return (number, max(0, len(mission.items) - 1), state, 0)
+    return (number, max(0, len(mission.items) - 1), state, int(in_auto))

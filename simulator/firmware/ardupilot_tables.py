@@ -43,7 +43,7 @@ MODES = {
         _by_position("GUIDED", 4, Behaviour.SETPOINT),
         _by_position("LOITER", 5, Behaviour.STICKS),
         _by_position("RTL", 6, Behaviour.RETURN, arms=False),
-        _by_position("CIRCLE", 7, Behaviour.HOLD, arms=False),
+        _by_position("CIRCLE", 7, Behaviour.STICKS, arms=False),
         Mode("LAND", "LAND", 9, BY_POSITION, Behaviour.LAND, arms=False),
         Mode("DRIFT", "DRIFT", 11, BY_HAND, Behaviour.STICKS, needs_position=True),
         _by_position("POSHOLD", 16, Behaviour.STICKS),

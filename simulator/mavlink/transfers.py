@@ -85,7 +85,6 @@ class Ack(IntEnum):
     ERROR = 1
     UNSUPPORTED = 3
     NO_SPACE = 4
-    INVALID_SEQUENCE = 13
     CANCELLED = 15
 
 
@@ -228,7 +227,7 @@ class MissionTransfer:
         self._whole = whole = message.get_type() == "MISSION_REQUEST_INT"
         is_home = self._firmware.home_item_first and message.seq == kind == 0
         if not (is_home or message.seq < len(items)):
-            self._acknowledge(peer, Ack.INVALID_SEQUENCE, kind)
+            self._acknowledge(peer, Ack.ERROR, kind)
             return
         item = self._home() if is_home else items[message.seq]
         places = (item.x, item.y) if whole else (item.x * 1e-7, item.y * 1e-7)
