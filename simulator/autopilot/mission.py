@@ -155,7 +155,7 @@ class Mission:
             self._begin(estimate.position_ned_m, home_ned_m, landed)
         if not math.isnan(self._climb_down_m):
             self._target_ned_m = (*self._target_ned_m[:2], self._climb_down_m)
-            within_m = self.parameters.role("reached_height_m")
+            within_m = self.parameters.role("climbed_within_m")
             if estimate.position_ned_m[2] < self._climb_down_m + within_m:
                 self._climb_down_m = math.nan
             return MotionSetpoint(self._target_ned_m)
@@ -312,7 +312,8 @@ class Mission:
         radius_m = item.params[1] if has_radius else self.parameters.role("reached_m")
         north, east, down = self._target_ned_m
         x, y, z = here_ned_m
-        height_m = self.parameters.role("reached_height_m")
+        takes_off = item.command == Kind.TAKEOFF
+        height_m = self.parameters.role("climbed_within_m" if takes_off else "reached_height_m")
         return math.hypot(x - north, y - east) < radius_m and abs(z - down) < height_m
 
     def _stay_s(self, item: MissionItem) -> float:

@@ -230,6 +230,8 @@ def test_arducopter_mission_ignores_item_yaw_and_returns_in_auto() -> None:
     bench.command(176, 1, 4)
     assert bench.command(400, 1) == [0]
     assert bench.command(300) == [0]
+    bench.run_until(lambda: bool(bench.of("MISSION_ITEM_REACHED")), 15.0)
+    assert bench.height_m == pytest.approx(5.0, abs=0.2)
     bench.run_until(lambda: bench.instance.autopilot.mission.finished, 30.0)
     assert bench.heading_deg == pytest.approx(90.0, abs=6.0)
     assert current(bench) == (3, 3, 1)
