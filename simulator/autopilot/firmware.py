@@ -243,8 +243,11 @@ class Firmware(ABC):
         return None
 
     @abstractmethod
-    def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
-        """Return MAV_MISSION_RESULT and text of the refusal of an item; None: it is accepted."""
+    def mission_refusal(
+        self, item: MissionItem, *, whole: bool
+    ) -> tuple[int, StatusText | None] | None:
+        """Return MAV_MISSION_RESULT and text of the refusal of an item; None: it is accepted.
+        `whole`: whether it came as MISSION_ITEM_INT."""
 
     def is_ground_station(self, kind: int, system: int, parameters: ParameterValues) -> bool:
         """Whether a heartbeat with this MAV_TYPE and system id comes from a ground station."""

@@ -199,7 +199,9 @@ class ArduCopter(Firmware):
             local[name] += here_m
         return local
 
-    def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
+    def mission_refusal(
+        self, item: MissionItem, *, whole: bool
+    ) -> tuple[int, StatusText | None] | None:
         for number, value in enumerate(item.params):
             may_be_nan = number == 3 and item.command in _YAWED and math.isnan(value)
             if not (math.isfinite(value) or may_be_nan):

@@ -11,6 +11,7 @@ from simulator.autopilot.mission import Kind
 from simulator.autopilot.values import AttitudeSetpoint
 from simulator.firmware.ardupilot_tables import BY_HAND, BY_POSITION
 from simulator.geodesy import GRAVITY_MPS2
+from simulator.mavlink import messages
 from simulator.mavlink.view import View, fit
 
 COMPANION_RATES_HZ = GROUND_RATES_HZ = {"HEARTBEAT": 1.0, "TIMESYNC": 0.1}
@@ -50,6 +51,13 @@ def heartbeat(view: View) -> Sequence[Any]:
         return view.heartbeat(base_mode, 5)
     in_air = commander.armed and not autopilot.position_controller.landed
     return view.heartbeat(base_mode, 4 if in_air else 3)
+
+
+def global_position_int(view: View) -> Sequence[Any]:
+    """Zeros before the first GPS fix."""
+    time_ms, *values, heading_cdeg = messages.global_position_int(view)
+    known = "fix" in view.autopilot.health.reached
+    return (time_ms, *(values if known else (0,) * len(values)), heading_cdeg)
 
 
 def sim_state(view: View) -> Sequence[Any]:

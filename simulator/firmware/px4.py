@@ -54,7 +54,8 @@ _LOCAL_NED, _BODY_NED = 1, 8  # MAV_FRAME
 
 _UNSUPPORTED_FRAME, _UNSUPPORTED = 2, 3  # MAV_MISSION_RESULT
 _COMMAND_FRAME = 2  # MAV_FRAME_MISSION: no place
-_PLACE_FRAMES = frozenset({0, 3, 5, 6})  # MAV_FRAME: GLOBAL, GLOBAL_RELATIVE_ALT, both with _INT
+# MAV_FRAME: GLOBAL, GLOBAL_RELATIVE_ALT; both with _INT, in MISSION_ITEM_INT only
+_PLACE_FRAMES, _INT_FRAMES = frozenset({0, 3}), frozenset({5, 6})
 _INVALID = critical("IGN MISSION_ITEM: Invalid item")
 # MAV_CMDs of mission items with a place, and without one
 _PLACES = frozenset({16, 17, 19, 21, 22, 31, 80, 84, 85, 195, 201, 4501})
@@ -184,8 +185,10 @@ class Px4(Firmware):
             return critical(f"{message} invalid coordinate frame {frame}")
         return critical(f"{message} coordinate frame {frame} unsupported")
 
-    def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
-        by_place = item.frame in _PLACE_FRAMES
+    def mission_refusal(
+        self, item: MissionItem, *, whole: bool
+    ) -> tuple[int, StatusText | None] | None:
+        by_place = item.frame in (_PLACE_FRAMES | _INT_FRAMES if whole else _PLACE_FRAMES)
         if not by_place and item.frame != _COMMAND_FRAME:
             return _UNSUPPORTED_FRAME, _INVALID
         if item.command not in (_PLACES if by_place else _ACTS):
@@ -254,6 +257,7 @@ PX4 = Px4(
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=telemetry,
+    withheld_until={"GLOBAL_POSITION_INT": "fix", "HOME_POSITION": "fix"},
     message_versions=telemetry.VERSIONS,
     position_grid_steps=2,
     fixed_streams=telemetry.ON_EVENT | {"HEARTBEAT"},

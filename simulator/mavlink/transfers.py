@@ -178,7 +178,7 @@ class MissionTransfer:
         if (peer, kind, message.seq) != expected:  # a duplicate
             return
         item = _read(message)
-        refused = None if kind else self._firmware.mission_refusal(item)
+        refused = None if kind else self._firmware.mission_refusal(item, whole=self._whole)
         if refused is not None:
             result, text = refused
             self._acknowledge(upload.peer, result, upload.kind)

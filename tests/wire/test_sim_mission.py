@@ -103,6 +103,15 @@ def test_arducopter_refuses_an_item_with_nan_or_an_unknown_command() -> None:
     assert upload(bench, [place(WAYPOINT, 12, 0, 4)]) == 0
 
 
+def test_px4_refuses_an_int_frame_in_the_message_with_degrees() -> None:
+    for frame, result in ((RELATIVE_INT, 2), (3, 0)):
+        bench = Bench()
+        send(bench, mavlink.MAVLink_mission_count_message(1, 1, 1))
+        fields = (0, frame, WAYPOINT, 0, 1, 0, 0, 0, 0, *degrees(bench, 9, 0), 5)
+        send(bench, mavlink.MAVLink_mission_item_message(1, 1, *fields))
+        assert acks(bench) == [result]
+
+
 def test_px4_holds_when_its_mission_is_cleared() -> None:
     bench = aloft(height_m=5.0)
     assert upload(bench, ROUND) == 0
