@@ -288,7 +288,7 @@ class Mission:
         north, east, down = self._position(item, home_ned_m)
         if item.command == Kind.TAKEOFF:
             north, east = self._target_ned_m[:2]
-            down = min(down, here_ned_m[2]) if self.firmware.takeoff_items_climb else down
+            down = min(down, here_ned_m[2]) if self.firmware.home_item_first else down
         if item.command == Kind.LAND:
             down = here_ned_m[2] if self.landing else self._target_ned_m[2]
         if item.command == Kind.LOITER_TURNS:

@@ -38,7 +38,6 @@ class Severity(IntEnum):
     EMERGENCY = 0
     CRITICAL = 2
     WARNING = 4
-    NOTICE = 5
     INFO = 6
 
 

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from simulator.autopilot.firmware import Firmware
+from simulator.autopilot.firmware import Firmware, Refusal
 from simulator.autopilot.state import StateEstimate
 from simulator.autopilot.values import (
     NAN3,
@@ -21,7 +21,6 @@ from simulator.autopilot.values import (
     MotionSetpoint,
     ParameterValues,
     Result,
-    StatusText,
     Triple,
     info,
     warning,
@@ -78,10 +77,8 @@ _ACTS = frozenset({
 
 _TITLES = {
     16: "WP", 17: "LoitUnlim", 18: "LoitTurns", 19: "LoitTime", 20: "RTL", 21: "Land",
-    22: "Takeoff", 31: "LoitAltitude", 82: "SplineWP", 93: "Delay", 112: "CondDelay",
-    114: "CondDist", 115: "CondYaw", 178: "ChangeSpeed", 179: "SetHome", 181: "SetRelay",
-    183: "SetServo", 189: "LandStart", 195: "SetROILocation", 197: "SetROINone", 201: "SetROI",
-    205: "MountControl", 206: "SetCamTrigDst", 207: "FenceEnable", 211: "Gripper",
+    22: "Takeoff", 31: "LoitAltitude", 82: "SplineWP", 93: "Delay", 115: "CondYaw",
+    178: "ChangeSpeed", 183: "SetServo", 195: "SetROILocation", 197: "SetROINone", 201: "SetROI",
 }  # fmt: skip
 
 _RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
@@ -199,9 +196,7 @@ class ArduCopter(Firmware):
             local[name] += here_m
         return local
 
-    def mission_refusal(
-        self, item: MissionItem, *, whole: bool
-    ) -> tuple[int, StatusText | None] | None:
+    def mission_refusal(self, item: MissionItem, *, whole: bool) -> Refusal | None:
         for number, value in enumerate(item.params):
             may_be_nan = number == 3 and item.command in _YAWED and math.isnan(value)
             if not (math.isfinite(value) or may_be_nan):
@@ -280,11 +275,8 @@ ARDUPILOT = ArduCopter(
     setpoints_imply_flight=True,
     item_frames={"MISSION_ITEM": _ITEM_FRAMES, "MISSION_ITEM_INT": _ITEM_FRAMES},
     home_item_first=True,
-    takeoff_items_climb=True,
-    guided_items=True,
     mission_text=info("Flight plan received"),
     item_titles=_TITLES,
-    disarming_resets_mission=True,
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=telemetry,

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from offboard.model.frames import rotation_from_quaternion
-from simulator.autopilot.firmware import Firmware
+from simulator.autopilot.firmware import Firmware, Refusal
 from simulator.autopilot.state import StateEstimate
 from simulator.autopilot.values import (
     Asked,
@@ -185,9 +185,7 @@ class Px4(Firmware):
             return critical(f"{message} invalid coordinate frame {frame}")
         return critical(f"{message} coordinate frame {frame} unsupported")
 
-    def mission_refusal(
-        self, item: MissionItem, *, whole: bool
-    ) -> tuple[int, StatusText | None] | None:
+    def mission_refusal(self, item: MissionItem, *, whole: bool) -> Refusal | None:
         by_place = item.frame in (_PLACE_FRAMES | _INT_FRAMES if whole else _PLACE_FRAMES)
         if not by_place and item.frame != _COMMAND_FRAME:
             return _UNSUPPORTED_FRAME, _INVALID

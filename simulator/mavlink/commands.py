@@ -242,14 +242,16 @@ class Commands:
         return Result.ACCEPTED if command.params[1] in (0.0, 1.0) else Result.DENIED
 
     def _start_mission(self, autopilot: Autopilot, command: Command) -> Result:
-        if autopilot.firmware.strict_places and any(command.params[:2]):
+        """MAV_CMD_MISSION_START; for ArduCopter it is a request of mode AUTO."""
+        strict = autopilot.firmware.strict_places
+        if strict and any(command.params[:2]):
             return Result.DENIED
         first = command.params[0] if math.isfinite(command.params[0]) else 0.0
         if not -1 <= first < max(1, len(autopilot.mission.items)):
             return Result.DENIED
         modes = autopilot.firmware.modes.values()
         mode = next(mode.name for mode in modes if mode.behaviour is Behaviour.MISSION)
-        return autopilot.handle("mission", Request(mode))
+        return autopilot.handle("mode" if strict else "mission", Request(mode))
 
     def _set_current_item(self, autopilot: Autopilot, command: Command) -> Result:
         number = command.params[0]

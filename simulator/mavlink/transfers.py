@@ -168,9 +168,7 @@ class MissionTransfer:
         """Handle MISSION_ITEM or MISSION_ITEM_INT of an upload."""
         self._whole = message.get_type() == "MISSION_ITEM_INT"
         upload, peer, kind = self._upload, sender_of(message), message.mission_type
-        if (
-            upload is None
-        ):  # the last item again, as its MISSION_ACK was lost; or there is no upload
+        if upload is None:  # the MISSION_ACK of the last item was lost, or there is no upload
             last = (kind, message.seq + 1) == self._taken
             self._acknowledge(peer, Ack.ACCEPTED if last else Ack.ERROR, kind)
             return
