@@ -166,8 +166,8 @@ class FlyMission(ActiveBehaviour):
 
 
 class FlyBySticks(ActiveBehaviour):
-    """ArduCopter LOITER, ALT_HOLD and POSHOLD; PX4 POSCTL and ALTCTL. Without stick input the
-    vehicle descends slowly."""
+    """ArduCopter LOITER, ALT_HOLD, POSHOLD and CIRCLE (without the circle); PX4 POSCTL and ALTCTL.
+    Without stick input the vehicle descends slowly."""
 
     lifts_off = True
 
@@ -222,7 +222,7 @@ class FollowSetpoint(ActiveBehaviour):
 
 
 BEHAVIOURS: Mapping[Behaviour, type[ActiveBehaviour]] = {
-    # hold, or fly to the place that a client named: PX4 AUTO.LOITER; ArduCopter BRAKE, CIRCLE
+    # hold, or fly to the place that a client named: PX4 AUTO.LOITER; ArduCopter BRAKE
     Behaviour.HOLD: ActiveBehaviour,
     Behaviour.TAKEOFF: Takeoff,
     Behaviour.LAND: Land,

@@ -68,7 +68,7 @@ class Commander:
         self.armed = self.failsafe = False
         self.reboot_requested = False
         self.refused: dict[str, StatusText] = {}  # events (and "offboard") that a fault refuses
-        self.texts: list[StatusText] = []
+        self.texts = guidance.mission.texts
         self.announcements: list[str] = []
         self._event, self._request = "", NO_REQUEST  # being handled
         self._cause = ""  # event that caused the failsafe
@@ -212,6 +212,8 @@ class Commander:
 
     def _disarm(self) -> None:
         self.armed, self._delayed = False, None
+        if self._firmware.home_item_first:
+            self._guidance.mission.reset()
         self._controller.enter(self.mode.behaviour)  # begins again when the vehicle is armed again
 
     def _fail(self) -> None:

@@ -30,6 +30,7 @@ from simulator.autopilot.values import (
 from simulator.vehicle.conditions import BatteryState
 
 _MAV_TYPE_GCS = 6
+Refusal = tuple[int, StatusText | None]  # MAV_MISSION_RESULT and text
 Role = str | float | tuple[str, float] | Callable[[ParameterValues], float]
 """Where a value comes from: a parameter, a constant, a parameter and a factor, or a function of
 parameters. `simulator.firmware.px4_tables.ROLES` says what each role means."""
@@ -69,10 +70,8 @@ class Rule:
     Args:
         event: name of the event; `Firmware.boot_events_s` has the events of the start.
         mode: names of the modes in which the row applies, separated by spaces; "*": any mode.
-        when: conditions that must all hold (`simulator.autopilot.commander.CONDITIONS`). "not X"
-            negates X. "NAME=1,2" holds if parameter NAME is 1 or 2, "NAME&4" if its bit 4 is set,
-            "since X" in a failsafe that event X caused, "reached X" after boot event X, "latched X"
-            after event X until a reboot, "requests X" if mode X is requested.
+        when: conditions that must all hold: those of `simulator.autopilot.commander.CONDITIONS`
+            and those that the README explains; "not X" negates X.
         to: name of the next mode; "*": no change; "requested": the mode that the command names;
             "remembered": the last chosen mode with `Mode.remembered`; `ByParameter`: the row fits
             only its values.
@@ -141,10 +140,12 @@ class Firmware(ABC):
     requests_kind_of_peer: bool = False  # requests items with or without _INT, as the peer last did
     # MAV_FRAME of a downloaded item, by its message and the MAV_FRAME of the upload
     item_frames: Mapping[str, Mapping[int, int]]
-    home_item_first: bool = False  # item 0 of a mission is home
-    takeoff_items_climb: bool = False  # a takeoff item does not make the vehicle descend
-    guided_items: bool = False  # a MISSION_ITEM with current = 2 is a place to fly to at once
+    # item 0 of a mission is home, a takeoff item does not make the vehicle descend, disarming
+    # resets the mission, and a MISSION_ITEM with current = 2 is a place to fly to at once
+    home_item_first: bool = False
     mission_text: StatusText | None = None  # text after an upload
+    # MAV_CMD -> name in the texts about the progress of a mission; without names there are none
+    item_titles: Mapping[int, str] = field(default_factory=dict)
     reached_above_landing: bool = False  # "item reached" also when above the place of a landing
     turning_items: frozenset[int] = frozenset()  # MAV_CMDs of items whose param4 is a yaw
 
@@ -240,8 +241,9 @@ class Firmware(ABC):
         return None
 
     @abstractmethod
-    def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
-        """Return MAV_MISSION_RESULT and text of the refusal of an item; None: it is accepted."""
+    def mission_refusal(self, item: MissionItem, *, whole: bool) -> Refusal | None:
+        """Return MAV_MISSION_RESULT and text of the refusal of an item; None: it is accepted.
+        `whole`: whether it came as MISSION_ITEM_INT."""
 
     def is_ground_station(self, kind: int, system: int, parameters: ParameterValues) -> bool:
         """Whether a heartbeat with this MAV_TYPE and system id comes from a ground station."""

@@ -14,7 +14,7 @@ from offboard.model.frames import wrap_pi
 from simulator.autopilot.firmware import Firmware
 from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.state import StateEstimate
-from simulator.autopilot.values import NAN3, MissionItem, MotionSetpoint, Triple
+from simulator.autopilot.values import NAN3, MissionItem, MotionSetpoint, StatusText, Triple, info
 from simulator.geodesy import down_m, to_metres
 
 ITEMS_MAX = 500
@@ -45,6 +45,8 @@ _PLACES = frozenset({
     Kind.WAYPOINT, Kind.LOITER_UNLIMITED, Kind.LOITER_TURNS, Kind.LOITER_TIME, Kind.LAND,
     Kind.TAKEOFF, Kind.LOITER_TO_ALTITUDE, Kind.SPLINE_WAYPOINT,
 })  # fmt: skip
+# reported as "Reached command" (`Firmware.item_titles`)
+_TOLD = frozenset({Kind.WAYPOINT, Kind.LOITER_TIME, Kind.SPLINE_WAYPOINT})
 _FACING = frozenset({Kind.FACE_PLACE, Kind.FACE_NONE, Kind.FACE})
 # param1: duration of stay, s
 _TIMED = frozenset({Kind.WAYPOINT, Kind.LOITER_TIME, Kind.SPLINE_WAYPOINT, Kind.DELAY})
@@ -53,8 +55,8 @@ _CIRCLE_M, _CIRCLE_RADPS = 10.0, math.radians(20.0)  # ArduCopter CIRCLE_RADIUS,
 
 @dataclass(slots=True)
 class Mission:
-    """Items and progress of one vehicle's mission. The autopilot gives `events` to the
-    commander."""
+    """Items and progress of one vehicle's mission. The autopilot gives `events` to the commander,
+    which shares `texts`."""
 
     firmware: Firmware
     parameters: ParameterTable
@@ -68,6 +70,7 @@ class Mission:
     under_way: bool = False
     speed_mps: float = math.inf
     events: list[str] = field(default_factory=list)
+    texts: list[StatusText] = field(default_factory=list)
     _climb_down_m: float = math.nan  # NED down to which it climbs vertically from the ground first
     _since_s: float = math.nan  # time at which the current place was reached
     _target_ned_m: Triple = NAN3
@@ -110,8 +113,11 @@ class Mission:
         if self.under_way and not items:
             self.events.append("mission cleared")
         self.parameters.set("MIS_TOTAL", len(items))  # PX4 has no such parameter
-        if continues:
-            return
+        if not continues:
+            self.reset()
+
+    def reset(self) -> None:
+        """Go back to the beginning."""
         self.current, self.reached, self.finished = self.first, -1, False
         self.speed_mps, self._since_s = math.inf, math.nan
         self._jumps.clear()
@@ -124,6 +130,8 @@ class Mission:
             return False
         self.current, self.finished = item, False
         self._since_s = math.nan
+        if self.under_way:
+            self._tell()
         return True
 
     def pause(self) -> None:
@@ -147,7 +155,7 @@ class Mission:
             self._begin(estimate.position_ned_m, home_ned_m, landed)
         if not math.isnan(self._climb_down_m):
             self._target_ned_m = (*self._target_ned_m[:2], self._climb_down_m)
-            within_m = self.parameters.role("reached_height_m")
+            within_m = self.parameters.role("climbed_within_m")
             if estimate.position_ned_m[2] < self._climb_down_m + within_m:
                 self._climb_down_m = math.nan
             return MotionSetpoint(self._target_ned_m)
@@ -166,9 +174,8 @@ class Mission:
         """Start the mission, or continue it where it was paused. A finished one starts again."""
         self.under_way = True
         if self.finished:
-            self.go_to(0)
-            self.speed_mps = math.inf
-            self._jumps.clear()
+            self.reset()
+        self._tell()
         self._target_ned_m = here_ned_m
         self._since_s = self._climb_down_m = self._turned_rad = math.nan
         self._faced_ned_m = None
@@ -229,8 +236,7 @@ class Mission:
         made = self._jumps.get(self.current, 0)
         if self.first <= target < len(self.items) and (times < 0 or made < times):
             self._jumps[self.current] = made + 1
-            self.current = int(target)
-            self._report("mission progress")
+            self._go_on(int(target))
         else:
             self._advance()
 
@@ -240,10 +246,19 @@ class Mission:
         if self.items[self.current].command in _PLACES:
             self._turned_rad = math.nan
         if self.current + 1 < len(self.items):
-            self.current += 1
-            self._report("mission progress")
+            self._go_on(self.current + 1)
         else:
             self._finish("mission finished")
+
+    def _go_on(self, number: int) -> None:
+        self.current = number
+        self._report("mission progress")
+        self._tell()
+
+    def _tell(self) -> None:
+        """Say which item begins."""
+        if title := self.firmware.item_titles.get(self.items[self.current].command):
+            self.texts.append(info(f"Mission: {self.current} {title}"))
 
     def _finish(self, event: str) -> None:
         self.finished = True
@@ -252,6 +267,8 @@ class Mission:
     def _report_reached(self) -> None:
         self.reached = self.current
         self._report("item reached")
+        if self.firmware.item_titles and self.items[self.current].command in _TOLD:
+            self.texts.append(info(f"Reached command #{self.current}"))
 
     def _report(self, event: str) -> None:
         if event not in self.events:
@@ -271,7 +288,7 @@ class Mission:
         north, east, down = self._position(item, home_ned_m)
         if item.command == Kind.TAKEOFF:
             north, east = self._target_ned_m[:2]
-            down = min(down, here_ned_m[2]) if self.firmware.takeoff_items_climb else down
+            down = min(down, here_ned_m[2]) if self.firmware.home_item_first else down
         if item.command == Kind.LAND:
             down = here_ned_m[2] if self.landing else self._target_ned_m[2]
         if item.command == Kind.LOITER_TURNS:
@@ -295,7 +312,8 @@ class Mission:
         radius_m = item.params[1] if has_radius else self.parameters.role("reached_m")
         north, east, down = self._target_ned_m
         x, y, z = here_ned_m
-        height_m = self.parameters.role("reached_height_m")
+        takes_off = item.command == Kind.TAKEOFF
+        height_m = self.parameters.role("climbed_within_m" if takes_off else "reached_height_m")
         return math.hypot(x - north, y - east) < radius_m and abs(z - down) < height_m
 
     def _stay_s(self, item: MissionItem) -> float:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from simulator.autopilot.firmware import Firmware
+from simulator.autopilot.firmware import Firmware, Refusal
 from simulator.autopilot.state import StateEstimate
 from simulator.autopilot.values import (
     NAN3,
@@ -21,7 +21,6 @@ from simulator.autopilot.values import (
     MotionSetpoint,
     ParameterValues,
     Result,
-    StatusText,
     Triple,
     info,
     warning,
@@ -44,8 +43,15 @@ _NOT_ENTERED = {
 }
 # MAV_CMDs that are accepted without effect in the simulator, and those that fail because their
 # devices are missing
-_TAKEN = (181, 203, 206, 207, 208, 209, 2001, 5300, 42001, 42003, 42424, 42428)
-_FAILED = (84, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
+_TAKEN = (
+    181, 182, 198, 202, 203, 206, 207, 208, 216, 2001, 2520, 2600, 5300, 42001, 42003, 42006, 42425,
+    42426, 42428, 42651, 43004,
+)  # fmt: skip
+_FAILED = (
+    84, 184, 188, 189, 193, 204, 205, 211, 218, 500, 601, 1000, 1001, 2000, 2500, 2501, 10001,
+    42429, 42600,
+)  # fmt: skip
+_DENIED = (32, 245, 532, 534, 42700)
 
 _CENTI = 0.01
 _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b111, 64, 128  # type_mask
@@ -68,6 +74,12 @@ _ACTS = frozenset({
     191, 193, 194, 195, 197, 202, 203, 205, 206, 207, 208, 210, 211, 212, 213, 215, 216, 217, 218,
     222, 223, 531, 532, 534, 600, 601, 1000, 2000, 2001, 2500, 2501, 3000, 42600, 42702, 42703,
 })  # fmt: skip
+
+_TITLES = {
+    16: "WP", 17: "LoitUnlim", 18: "LoitTurns", 19: "LoitTime", 20: "RTL", 21: "Land",
+    22: "Takeoff", 31: "LoitAltitude", 82: "SplineWP", 93: "Delay", 115: "CondYaw",
+    178: "ChangeSpeed", 183: "SetServo", 195: "SetROILocation", 197: "SetROINone", 201: "SetROI",
+}  # fmt: skip
 
 _RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
 
@@ -184,7 +196,7 @@ class ArduCopter(Firmware):
             local[name] += here_m
         return local
 
-    def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
+    def mission_refusal(self, item: MissionItem, *, whole: bool) -> Refusal | None:
         for number, value in enumerate(item.params):
             may_be_nan = number == 3 and item.command in _YAWED and math.isnan(value)
             if not (math.isfinite(value) or may_be_nan):
@@ -256,17 +268,15 @@ ARDUPILOT = ArduCopter(
     command_answers={
         **dict.fromkeys(_TAKEN, Result.ACCEPTED),
         **dict.fromkeys(_FAILED, Result.FAILED),
-        245: Result.DENIED,
-        532: Result.DENIED,
+        **dict.fromkeys(_DENIED, Result.DENIED),
     },
     global_frames=frozenset({0, 3, 5, 6, 10, 11}),
     setpoints_as_automatic=True,
     setpoints_imply_flight=True,
     item_frames={"MISSION_ITEM": _ITEM_FRAMES, "MISSION_ITEM_INT": _ITEM_FRAMES},
     home_item_first=True,
-    takeoff_items_climb=True,
-    guided_items=True,
     mission_text=info("Flight plan received"),
+    item_titles=_TITLES,
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=telemetry,

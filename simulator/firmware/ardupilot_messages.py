@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from offboard.model.frames import euler_from_quaternion
+from simulator.autopilot.mission import Kind
 from simulator.autopilot.values import AttitudeSetpoint
 from simulator.firmware.ardupilot_tables import BY_HAND, BY_POSITION
 from simulator.geodesy import GRAVITY_MPS2
+from simulator.mavlink import messages
 from simulator.mavlink.view import View, fit
 
 COMPANION_RATES_HZ = GROUND_RATES_HZ = {"HEARTBEAT": 1.0, "TIMESYNC": 0.1}
@@ -49,6 +51,13 @@ def heartbeat(view: View) -> Sequence[Any]:
         return view.heartbeat(base_mode, 5)
     in_air = commander.armed and not autopilot.position_controller.landed
     return view.heartbeat(base_mode, 4 if in_air else 3)
+
+
+def global_position_int(view: View) -> Sequence[Any]:
+    """Zeros before the first GPS fix."""
+    time_ms, *values, heading_cdeg = messages.global_position_int(view)
+    known = "fix" in view.autopilot.health.reached
+    return (time_ms, *(values if known else (0,) * len(values)), heading_cdeg)
 
 
 def sim_state(view: View) -> Sequence[Any]:
@@ -130,13 +139,16 @@ _NO_MISSION, _NOT_STARTED, _ACTIVE, _PAUSED, _COMPLETE = range(1, 6)  # MISSION_
 
 
 def mission_current(view: View) -> Sequence[Any]:
-    """The number of items is without home; before the start, the current item is home (0)."""
-    mission = view.autopilot.mission
+    """The number of items is without home; before the start, the current item is home (0). A
+    return is part of the mission, in mode AUTO."""
+    mission, in_auto = view.autopilot.mission, view.autopilot.commander.mode.name == "AUTO"
     begun = mission.under_way or mission.reached >= 0 or mission.current > mission.first
     state = _NO_MISSION
     if mission.flyable:
         state = _PAUSED if begun else _NOT_STARTED
         state = _ACTIVE if mission.under_way else state
-        state = _COMPLETE if mission.finished else state
+        if mission.finished:
+            returns = in_auto and mission.items[mission.current].command == Kind.RETURN
+            state = _ACTIVE if returns else _COMPLETE
     number = mission.current if begun else 0
-    return (number, max(0, len(mission.items) - 1), state, 0)
+    return (number, max(0, len(mission.items) - 1), state, int(in_auto))

@@ -34,7 +34,7 @@ MODES = {
         _by_position("GUIDED", 4, Behaviour.SETPOINT),
         _by_position("LOITER", 5, Behaviour.STICKS),
         _by_position("RTL", 6, Behaviour.RETURN, arms=False),
-        _by_position("CIRCLE", 7, Behaviour.HOLD, arms=False),
+        _by_position("CIRCLE", 7, Behaviour.STICKS, arms=False),
         Mode("LAND", "LAND", 9, BY_POSITION, Behaviour.LAND, arms=False),
         Mode("DRIFT", "DRIFT", 11, BY_HAND, Behaviour.STICKS, needs_position=True),
         _by_position("POSHOLD", 16, Behaviour.STICKS),
@@ -224,6 +224,7 @@ ROLES: dict[str, Role] = {
 _FAILED = Result.FAILED
 _NO_POSITION = warning("Mode change to {mode} failed: requires position")
 _NOT_STARTED = warning("Mode change to {mode} failed: init failed")
+_NO_TAKEOFF = critical("Auto: Missing Takeoff Cmd")
 _HEARTBEAT = ("HEARTBEAT",)
 _ORIGIN_AND_HOME = ("GPS_GLOBAL_ORIGIN", "HOME_POSITION")
 _ARMING = Rule("arm", do=("arm",), texts=(info("Arming motors"),), send=_ORIGIN_AND_HOME)
@@ -283,23 +284,9 @@ def _refusals(event: str, prefix: str, result: Result) -> list[Rule]:
     return [row for row in rows if event == "arm" or "not mode arms" not in row.when]
 
 
-def _entries(event: str) -> list[Rule]:
-    """Rows that enter the requested mode; while armed, only if the mode can start."""
-
-    def refuses(*when: str, texts: tuple[StatusText, ...]) -> Rule:
-        return Rule(event, when=when, result=_FAILED, texts=texts)
-
-    no_takeoff = critical("Auto: Missing Takeoff Cmd")
-    return [
-        Rule(event, when=("not armed",), to="requested", send=_HEARTBEAT),
-        refuses("position missing", texts=(_NO_POSITION,)),
-        refuses("requests AUTO", "mission missing", texts=(_NOT_STARTED,)),
-        refuses(
-            "requests AUTO", "landed", "takeoff item missing", texts=(no_takeoff, _NOT_STARTED)
-        ),
-        refuses("requests THROW", texts=(_NOT_STARTED,)),
-        Rule(event, to="requested", send=_HEARTBEAT),
-    ]
+def _fails(event: str, *when: str, texts: tuple[StatusText, ...]) -> Rule:
+    """A row that refuses a request."""
+    return Rule(event, when=when, result=_FAILED, texts=texts)
 
 
 RULES = (
@@ -313,15 +300,24 @@ RULES = (
     ),
     Rule("position", texts=(info("EKF3 IMU0 is using GPS"), info("EKF3 IMU1 is using GPS"))),
     # A heartbeat follows a mode change at once
-    *_entries("mode"),
+    Rule("mode", when=("not armed",), to="requested", send=_HEARTBEAT),
+    _fails("mode", "position missing", texts=(_NO_POSITION,)),
+    _fails("mode", "requests AUTO", "mission missing", texts=(_NOT_STARTED,)),
+    _fails(
+        "mode", "requests AUTO", "landed", "takeoff item missing", texts=(_NO_TAKEOFF, _NOT_STARTED)
+    ),
+    _fails("mode", "requests THROW", texts=(_NOT_STARTED,)),
+    Rule("mode", to="requested", send=_HEARTBEAT),
     Rule("turn"),
     Rule("home", send=("HOME_POSITION",)),
     Rule("speed", "GUIDED AUTO RTL"),
     Rule("speed", result=_FAILED),
     Rule("servo"),
+    _fails("motor test", "not landed", texts=(critical("Motor Test: vehicle not landed"),)),
+    _fails("calibration", "armed", texts=(warning("Disarm to allow calibration"),)),
+    _fails("compass calibration", "armed", texts=(warning("Disarm to allow compass calibration"),)),
     Rule("loiter", when=("not position missing",), to="LOITER", send=_HEARTBEAT),
     Rule("loiter", result=_FAILED),
-    *_entries("mission"),
     Rule("mission progress", send=("MISSION_CURRENT",)),
     Rule("item reached", send=("MISSION_ITEM_REACHED",)),
     Rule("mission return", "AUTO", do=("return",)),  # the mode does not change
@@ -331,9 +327,7 @@ RULES = (
     Rule("climbed", "GUIDED", do=("hold",)),
     Rule("land", to="LAND", send=_HEARTBEAT),
     Rule("return", when=("reached position",), to="RTL", send=_HEARTBEAT),
-    Rule(
-        "return", result=_FAILED, texts=(critical("Mode change to RTL failed: requires position"),)
-    ),
+    _fails("return", texts=(critical("Mode change to RTL failed: requires position"),)),
     Rule("checks", when=("armed",), result=Result.TEMPORARILY_REJECTED),
     *_refusals("checks", "PreArm", Result.ACCEPTED),
     Rule("arm", when=("armed",)),

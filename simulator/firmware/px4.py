@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from offboard.model.frames import rotation_from_quaternion
-from simulator.autopilot.firmware import Firmware
+from simulator.autopilot.firmware import Firmware, Refusal
 from simulator.autopilot.state import StateEstimate
 from simulator.autopilot.values import (
     Asked,
@@ -42,9 +42,10 @@ _BY_FLAGS = ((4, "AUTO.MISSION"), (64 | 8, "POSCTL"), (64 | 16, "STABILIZED"), (
 _NO_AUTO_MODE = critical("Unsupported auto mode")
 
 # MAV_CMDs that are accepted without effect in the simulator, and those that are not acknowledged
-_TAKEN = (80, 187, 191, 195, 197, 201, 245, 519, 525, 528)
+_TAKEN = (80, 187, 191, 195, 196, 197, 201, 245, 519, 525, 528)
 _UNANSWERED = (
-    1, 93, 203, 204, 205, 206, 214, 220, 242, 243, 260, 310, 420, 500, 521, 530, 531, 532, 3000
+    1, 93, 203, 204, 205, 206, 214, 220, 242, 243, 260, 310, 420, 500, 521, 530, 531, 532, 1000,
+    1001, 2003, 3000, 42600,
 )  # fmt: skip
 
 _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b011, 64, 128  # type_mask
@@ -53,7 +54,8 @@ _LOCAL_NED, _BODY_NED = 1, 8  # MAV_FRAME
 
 _UNSUPPORTED_FRAME, _UNSUPPORTED = 2, 3  # MAV_MISSION_RESULT
 _COMMAND_FRAME = 2  # MAV_FRAME_MISSION: no place
-_PLACE_FRAMES = frozenset({0, 3, 5, 6})  # MAV_FRAME: GLOBAL, GLOBAL_RELATIVE_ALT, both with _INT
+# MAV_FRAME: GLOBAL, GLOBAL_RELATIVE_ALT; both with _INT, in MISSION_ITEM_INT only
+_PLACE_FRAMES, _INT_FRAMES = frozenset({0, 3}), frozenset({5, 6})
 _INVALID = critical("IGN MISSION_ITEM: Invalid item")
 # MAV_CMDs of mission items with a place, and without one
 _PLACES = frozenset({16, 17, 19, 21, 22, 31, 80, 84, 85, 195, 201, 4501})
@@ -183,8 +185,8 @@ class Px4(Firmware):
             return critical(f"{message} invalid coordinate frame {frame}")
         return critical(f"{message} coordinate frame {frame} unsupported")
 
-    def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
-        by_place = item.frame in _PLACE_FRAMES
+    def mission_refusal(self, item: MissionItem, *, whole: bool) -> Refusal | None:
+        by_place = item.frame in (_PLACE_FRAMES | _INT_FRAMES if whole else _PLACE_FRAMES)
         if not by_place and item.frame != _COMMAND_FRAME:
             return _UNSUPPORTED_FRAME, _INVALID
         if item.command not in (_PLACES if by_place else _ACTS):
@@ -241,7 +243,6 @@ PX4 = Px4(
         **dict.fromkeys(_TAKEN, Result.ACCEPTED),
         **dict.fromkeys(_UNANSWERED),
         189: Result.CANCELLED,
-        211: Result.DENIED,
         224: Result.UNSUPPORTED,  # clients use the message MISSION_SET_CURRENT
     },
     global_frames=frozenset({5, 6, 11}),
@@ -254,6 +255,7 @@ PX4 = Px4(
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=telemetry,
+    withheld_until={"GLOBAL_POSITION_INT": "fix", "HOME_POSITION": "fix"},
     message_versions=telemetry.VERSIONS,
     position_grid_steps=2,
     fixed_streams=telemetry.ON_EVENT | {"HEARTBEAT"},

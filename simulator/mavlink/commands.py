@@ -233,15 +233,25 @@ class Commands:
         restart = command.params[0] >= 1.0
         return autopilot.handle("reboot") if restart else Result.UNSUPPORTED
 
+    def _calibrate(self, autopilot: Autopilot, command: Command) -> Result:
+        """MAV_CMD_PREFLIGHT_CALIBRATION, without effect."""
+        return autopilot.handle("calibration") if any(command.params) else Result.UNSUPPORTED
+
+    def _grip(self, _: Autopilot, command: Command) -> Result:
+        """MAV_CMD_DO_GRIPPER, without effect: param2 is 0 or 1."""
+        return Result.ACCEPTED if command.params[1] in (0.0, 1.0) else Result.DENIED
+
     def _start_mission(self, autopilot: Autopilot, command: Command) -> Result:
-        if autopilot.firmware.strict_places and any(command.params[:2]):
+        """MAV_CMD_MISSION_START; for ArduCopter it is a request of mode AUTO."""
+        strict = autopilot.firmware.strict_places
+        if strict and any(command.params[:2]):
             return Result.DENIED
         first = command.params[0] if math.isfinite(command.params[0]) else 0.0
         if not -1 <= first < max(1, len(autopilot.mission.items)):
             return Result.DENIED
         modes = autopilot.firmware.modes.values()
         mode = next(mode.name for mode in modes if mode.behaviour is Behaviour.MISSION)
-        return autopilot.handle("mission", Request(mode))
+        return autopilot.handle("mode" if strict else "mission", Request(mode))
 
     def _set_current_item(self, autopilot: Autopilot, command: Command) -> Result:
         number = command.params[0]
@@ -309,7 +319,10 @@ HANDLERS: dict[int, Callable[[Commands, Autopilot, Command], Result | None]] = {
     195: Commands._face,  # DO_SET_ROI_LOCATION
     197: Commands._face,  # DO_SET_ROI_NONE
     201: Commands._face,  # DO_SET_ROI
+    209: lambda _, autopilot, __: autopilot.handle("motor test"),  # DO_MOTOR_TEST
+    211: Commands._grip,  # DO_GRIPPER
     224: Commands._set_current_item,  # DO_SET_MISSION_CURRENT
+    241: Commands._calibrate,  # PREFLIGHT_CALIBRATION
     246: Commands._reboot,  # PREFLIGHT_REBOOT_SHUTDOWN
     300: Commands._start_mission,  # MISSION_START
     400: Commands._arm_disarm,  # COMPONENT_ARM_DISARM
@@ -319,6 +332,7 @@ HANDLERS: dict[int, Callable[[Commands, Autopilot, Command], Result | None]] = {
     511: Commands._set_interval,  # SET_MESSAGE_INTERVAL
     512: Commands._request_message,  # REQUEST_MESSAGE
     520: lambda commands, *_: commands._send("AUTOPILOT_VERSION"),  # REQUEST_AUTOPILOT_CAPABILITIES
+    42424: lambda _, autopilot, __: autopilot.handle("compass calibration"),  # DO_START_MAG_CAL
 }
 
 

@@ -149,7 +149,7 @@ class Server:
         self._commands.set_mode(message.base_mode, message.custom_mode, sender_of(message))
 
     def _mission_item(self, message: Message) -> None:
-        if not (self.view.autopilot.firmware.guided_items and message.current == _GUIDED):
+        if not (self.view.autopilot.firmware.home_item_first and message.current == _GUIDED):
             self._missions.item(message)
             return
         scale = 1e-7 if message.get_type().endswith("INT") else 1.0

@@ -116,7 +116,7 @@ class Schedule:
             return False
         if interval_us == 0:
             rate_hz = self.rates_hz.get(name)
-            interval_us = -1.0 if rate_hz is None else 1e6 / rate_hz
+            interval_us = 1e6 / rate_hz if rate_hz else -1.0
         if interval_us < 0:
             self.streams.pop(name, None)
             return True
@@ -126,6 +126,9 @@ class Schedule:
         return True
 
     def set_group(self, group: int, rate_hz: float) -> None:
-        """Apply REQUEST_DATA_STREAM to a MAV_DATA_STREAM; 0 stops its messages."""
-        for name in self.view.autopilot.firmware.stream_groups.get(group, ()):
-            self.set_interval(name, 1e6 / rate_hz if rate_hz else -1.0)
+        """Apply REQUEST_DATA_STREAM to a MAV_DATA_STREAM; 0 stops its messages. It is then the
+        default of their intervals."""
+        names = self.view.autopilot.firmware.stream_groups.get(group, ())
+        self.rates_hz = {**self.rates_hz, **dict.fromkeys(names, rate_hz)}
+        for name in names:
+            self.set_interval(name, 0.0)

@@ -85,7 +85,6 @@ class Ack(IntEnum):
     ERROR = 1
     UNSUPPORTED = 3
     NO_SPACE = 4
-    INVALID_SEQUENCE = 13
     CANCELLED = 15
 
 
@@ -169,9 +168,7 @@ class MissionTransfer:
         """Handle MISSION_ITEM or MISSION_ITEM_INT of an upload."""
         self._whole = message.get_type() == "MISSION_ITEM_INT"
         upload, peer, kind = self._upload, sender_of(message), message.mission_type
-        if (
-            upload is None
-        ):  # the last item again, as its MISSION_ACK was lost; or there is no upload
+        if upload is None:  # the MISSION_ACK of the last item was lost, or there is no upload
             last = (kind, message.seq + 1) == self._taken
             self._acknowledge(peer, Ack.ACCEPTED if last else Ack.ERROR, kind)
             return
@@ -179,7 +176,7 @@ class MissionTransfer:
         if (peer, kind, message.seq) != expected:  # a duplicate
             return
         item = _read(message)
-        refused = None if kind else self._firmware.mission_refusal(item)
+        refused = None if kind else self._firmware.mission_refusal(item, whole=self._whole)
         if refused is not None:
             result, text = refused
             self._acknowledge(upload.peer, result, upload.kind)
@@ -228,7 +225,7 @@ class MissionTransfer:
         self._whole = whole = message.get_type() == "MISSION_REQUEST_INT"
         is_home = self._firmware.home_item_first and message.seq == kind == 0
         if not (is_home or message.seq < len(items)):
-            self._acknowledge(peer, Ack.INVALID_SEQUENCE, kind)
+            self._acknowledge(peer, Ack.ERROR, kind)
             return
         item = self._home() if is_home else items[message.seq]
         places = (item.x, item.y) if whole else (item.x * 1e-7, item.y * 1e-7)

@@ -60,6 +60,20 @@ def test_arducopter_sends_heartbeat_timesync_and_home_unrequested() -> None:
     }
 
 
+def test_arducopter_streams_a_requested_group_also_after_an_interval_of_0() -> None:
+    """Before the first GPS fix, at 10.2 s of the real one, the global position is 0, 0."""
+    vehicle = Bench(firmware=ARDUPILOT)
+    vehicle.send(mavlink.MAVLink_request_data_stream_message(1, 1, 6, 4, 1))
+    for interval_us, rate_hz in ((0, 4), (-1, 0), (0, 4), (1e5, 10)):
+        assert vehicle.command(511, 33, interval_us) == [0]
+        since_s = vehicle.time_s
+        vehicle.run(3.0)
+        assert len(vehicle.of("GLOBAL_POSITION_INT", since_s)) == pytest.approx(3 * rate_hz, abs=1)
+    places = [(m.lat, m.lon) for _, m in vehicle.of("GLOBAL_POSITION_INT")]
+    assert places[0] == (0, 0)
+    assert places[-1] == pytest.approx([value * 1e7 for value in ARDUPILOT.origin[:2]], abs=100)
+
+
 def test_mode_change_sends_a_heartbeat_even_just_after_one() -> None:
     vehicle = guided()
     since_s = vehicle.time_s
@@ -406,6 +420,10 @@ def test_only_px4_applies_a_climb_speed_to_horizontal_flight(
         ("GUIDED", 510, RELATIVE, (60_000.0, 0.0, 0.0, 0.0), 4),
         ("GUIDED", 178, RELATIVE, (1.0, 3.0, 0.0, 0.0), ACCEPTED),
         ("LOITER", 178, RELATIVE, (1.0, 3.0, 0.0, 0.0), FAILED),
+        ("GUIDED", 209, RELATIVE, (1.0, 0.0, 5.0, 1.0), FAILED),  # motor test in the air
+        ("GUIDED", 241, RELATIVE, (1.0, 0.0, 0.0, 0.0), FAILED),  # calibration while armed
+        ("GUIDED", 42424, RELATIVE, (0.0, 0.0, 1.0, 0.0), FAILED),
+        ("GUIDED", 1000, RELATIVE, (0.0, 0.0, 0.0, 0.0), FAILED),  # no gimbal
     ],
 )
 def test_arducopter_answers_unusual_commands_as_the_real_one(

@@ -120,6 +120,12 @@ def test_px4_accepts_a_mode_given_by_base_mode_flags(base_mode: int, mode: int) 
     assert bench.mode == mode
 
 
+def test_px4_has_a_gripper_and_does_not_answer_for_a_gimbal() -> None:
+    bench = Bench()
+    assert bench.command(211, 1, 1) == [0]
+    assert bench.command(1000) == []
+
+
 def test_px4_landing_continues_without_a_ground_station() -> None:
     """Its pre-arm checks pass, though it could not be armed in this mode."""
     bench = aloft(height_m=30.0)

@@ -96,8 +96,14 @@ def test_messages_for_others_are_forwarded_between_the_links() -> None:
 
 
 def test_each_link_has_px4_rates_and_its_own_sequence() -> None:
-    """Each datagram contains whole frames."""
+    """Each datagram contains whole frames. The global position waits for the first GPS fix."""
     bench = Bench(ground_link=True)
+    bench.run(2.9)
+    assert bench.of("LOCAL_POSITION_NED")
+    assert not bench.of("GLOBAL_POSITION_INT")
+    bench.run(0.2)
+    assert len(bench.of("GLOBAL_POSITION_INT")) > 3
+    bench.instance.drain_ground()
     bench.send(mavlink.MAVLink_param_request_list_message(1, 1))
     companion, ground = (link.outbox for link in bench.instance.links)
     heard: dict[str, list[bytes]] = {"companion": [], "ground": []}
@@ -116,7 +122,7 @@ def test_each_link_has_px4_rates_and_its_own_sequence() -> None:
             name: pytest.approx(rate, abs=0.1) for name, rate in rates_hz.items()
         }
         sequence = [m.get_seq() for m in messages]
-        assert sequence == [i % 256 for i in range(len(sequence))]
+        assert sequence == [(sequence[0] + i) % 256 for i in range(len(sequence))]
 
 
 def test_message_interval_can_be_stopped_restored_and_read() -> None:

@@ -103,6 +103,15 @@ def test_arducopter_refuses_an_item_with_nan_or_an_unknown_command() -> None:
     assert upload(bench, [place(WAYPOINT, 12, 0, 4)]) == 0
 
 
+def test_px4_refuses_an_int_frame_in_the_message_with_degrees() -> None:
+    for frame, result in ((RELATIVE_INT, 2), (3, 0)):
+        bench = Bench()
+        send(bench, mavlink.MAVLink_mission_count_message(1, 1, 1))
+        fields = (0, frame, WAYPOINT, 0, 1, 0, 0, 0, 0, *degrees(bench, 9, 0), 5)
+        send(bench, mavlink.MAVLink_mission_item_message(1, 1, *fields))
+        assert acks(bench) == [result]
+
+
 def test_px4_holds_when_its_mission_is_cleared() -> None:
     bench = aloft(height_m=5.0)
     assert upload(bench, ROUND) == 0
@@ -195,7 +204,7 @@ def test_the_first_item_of_arducopter_is_home() -> None:
         assert upload(bench, [place(WAYPOINT, 50, 50, 0), place(WAYPOINT, 9, 0, 5)]) == 0
     assert bench.instance.autopilot.parameters["MIS_TOTAL"] == 2
     send(bench, mavlink.MAVLink_mission_request_message(1, 1, 2))
-    assert acks(bench)[-1] == 13
+    assert acks(bench)[-1] == 1
 
 
 def test_px4_takes_the_yaw_of_a_mission_item() -> None:
@@ -208,8 +217,16 @@ def test_px4_takes_the_yaw_of_a_mission_item() -> None:
     assert bench.place == pytest.approx((12, 6, -6), abs=1.0)
 
 
+def current(bench: Bench) -> tuple[int, int, int]:
+    """Number, state and mode of MISSION_CURRENT, on request."""
+    bench.command(512, 42)
+    _, message = bench.of("MISSION_CURRENT")[-1]
+    return message.seq, message.mission_state, message.mission_mode
+
+
 def test_arducopter_mission_ignores_item_yaw_and_returns_in_auto() -> None:
-    """param4 is no heading for ArduCopter. The mode is AUTO until the landing and after it."""
+    """param4 is no heading for ArduCopter. The mode is AUTO, with an active mission, until the
+    landing, and AUTO after it. Each item is announced when it begins."""
     bench = Bench(firmware=ARDUPILOT, boot_scale=0.1)
     bench.run(4.5)
     rows = [
@@ -222,11 +239,17 @@ def test_arducopter_mission_ignores_item_yaw_and_returns_in_auto() -> None:
     bench.command(176, 1, 4)
     assert bench.command(400, 1) == [0]
     assert bench.command(300) == [0]
+    bench.run_until(lambda: bool(bench.of("MISSION_ITEM_REACHED")), 15.0)
+    assert bench.height_m == pytest.approx(5.0, abs=0.2)
     bench.run_until(lambda: bench.instance.autopilot.mission.finished, 30.0)
     assert bench.heading_deg == pytest.approx(90.0, abs=6.0)
+    assert current(bench) == (3, 3, 1)
     bench.run_until(lambda: not bench.armed, 70.0)
     assert bench.mode == 3
     assert math.hypot(*bench.place[:2]) < 0.5
+    begun = ["Mission: 1 Takeoff", "Mission: 2 WP", "Reached command #2", "Mission: 3 RTL"]
+    assert [text for text in bench.texts() if "ission: " in text or "Reached" in text] == begun
+    assert current(bench) == (0, 2, 1)  # not started: disarming resets it
 
 
 def test_arducopter_mission_restarted_in_the_air_stays_level() -> None:
