@@ -230,6 +230,10 @@ def _begin_track(flight: FlightState, source: Phase) -> None:
         flight.plan.resume(flight.time_s)
 
 
+def _begin_hand_back(flight: FlightState, source: Phase) -> None:
+    flight.returns_to = flight.authority.engaged_from if source is Phase.HAND_BACK else ""
+
+
 def _begin_land(flight: FlightState, source: Phase) -> None:
     flight.touchdown = Touchdown(flight.home_ned_m if flight.took_off else None)
 
@@ -271,6 +275,7 @@ BEGINS: Mapping[Phase, Callable[[FlightState, Phase], None]] = {
     Phase.JOIN: _begin_join,
     Phase.PAUSE: _begin_pause,
     Phase.TRACK: _begin_track,
+    Phase.HAND_BACK: _begin_hand_back,
     Phase.LAND: _begin_land,
 }
 """What begins with a phase: a function of the flight and of the phase before."""
