@@ -19,6 +19,7 @@ from offboard.flight.phases import (
     BEFORE_FLIGHT,
     FLYING,
     TRACKING,
+    WAITING,
     ExitCode,
     Outcome,
     Phase,
@@ -101,7 +102,7 @@ def obey(flight: FlightState, request: Request, sender: str) -> bool:
         _enter(flight, row)
         flight.obeyed = request
     elif not obeyed and flight.now_s - flight.refused_s >= REFUSALS_EVERY_S:
-        starts = request is Request.START and flight.phase is Phase.STANDBY
+        starts = request is Request.START and flight.phase in WAITING
         why = starting.not_started(flight) if starts else f"not in the phase {flight.phase.value}"
         outbox.announce(flight, f"refused: {sentence}, but {why}")
         flight.refused_s = flight.now_s

@@ -409,10 +409,13 @@ def test_service_without_arms_option_stays_on_the_ground(served: Served) -> None
     pair.run(9.8)
     assert pair.phase is Phase.HEALTH
     assert said(pair, "several vehicles are heard, systems 1 and 9. Fix: choose one")
+    pair.command(START)
+    pair.run(0.1)
+    assert said(pair, "but it is on the ground, and may not be armed without --arms")
     pair.until(lambda: pair.phase is Phase.STANDBY, 1.0)
     pair.command(START)
     pair.run(3.0)
-    assert pair.acks == [(START, TEMPORARILY_REJECTED)]
+    assert pair.acks == [(START, TEMPORARILY_REJECTED)] * 2
     assert said(pair, "but it is on the ground, and may not be armed without --arms")
     assert commanded(pair, 0.0) == []
     pair.restart()
