@@ -92,12 +92,12 @@ def _end(flight: FlightState) -> None:
     holds = flight.phase is not Phase.LAND
     if not holds:
         _await_link(flight)
-    mode = dialect.hold_mode if holds else dialect.land_mode
+    mode = flight.holds_in if holds else dialect.land_mode
     fails = authority.standing is Standing.FAILSAFE
     if fails and authority.mode == dialect.return_mode:
         return  # the owner has chosen this for missing setpoints: it lands where it took off
     if authority.mode != mode:
-        if outbox.request(flight, dialect.hold() if holds else CommandLong.land()):
+        if outbox.request(flight, dialect.set_mode(mode) if holds else CommandLong.land()):
             authority.request(mode)
     elif not holds:
         _disarm_if_standing(flight)

@@ -56,6 +56,7 @@ class Authority:
     engage_mode: str = ""
     standing: Standing = Standing.FREE
     mode: str = "unknown"
+    engaged_from: str = ""  # the mode reported before the newest switch to `engage_mode`
     report_s: float = -math.inf  # time of the newest report
     counted_report_s: float = -math.inf  # time of the newest report that counts
     lost_reason: str = ""
@@ -89,6 +90,8 @@ class Authority:
         the pilot may fly it in that failsafe (None: not known).
         """
         before, self.mode = self.mode, mode
+        if mode == self.engage_mode != before:
+            self.engaged_from = before
         self.report_s, self.arrived_s = now_s, arrived_s
         if arrived_s >= self._counts_from_s:
             self.counted_report_s = now_s

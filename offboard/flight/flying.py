@@ -174,11 +174,22 @@ def failsafe_hold(flight: FlightState) -> bool:
 def hold_refused(flight: FlightState) -> str:
     """The autopilot cannot hold: PX4 without a global position, as by motion capture, does not."""
     assert flight.dialect is not None
-    hold = flight.dialect.hold()
+    hold = flight.dialect.set_mode(flight.holds_in)
     result = flight.vehicle.results.get(hold.command, "ACCEPTED")
     if hold not in flight.requested_s or result in GOOD_RESULTS:
         return ""
-    return f"the vehicle refuses {flight.dialect.hold_mode} ({result})"
+    return f"the vehicle refuses {flight.holds_in} ({result})"
+
+
+def refused_to_pilot(flight: FlightState) -> str:
+    """The autopilot cannot hold a vehicle that was not flown: its pilot flies on by sticks, in the
+    mode in which he did."""
+    refused, before = hold_refused(flight), flight.authority.engaged_from
+    flown = flight.outcome is None or flight.outcome.exit_code != REFUSED
+    assert flight.dialect is not None
+    if not refused or flown or before not in flight.dialect.assisted_modes or flight.returns_to:
+        return ""
+    return f"{refused}: back to {before}"
 
 
 def landed(flight: FlightState) -> bool:
@@ -292,6 +303,7 @@ TO_THE_END = (
 HANDED_BACK, NOT_BEGUN = "handed back on request", "stopped on request"
 hand_back, start = requested(Request.HAND_BACK), requested(Request.START)
 SERVICE_ENDS = (
+    Transition({HAND_BACK}, refused_to_pilot, HAND_BACK),
     Transition({HAND_BACK}, hold_refused, LAND, ABORTED),
     Transition({HAND_BACK}, longer_than("hand_back_s"), LAND, ABORTED, reason=DID_NOT_HOLD),
     Transition({TAKEOFF} | TRACKING, hand_back, HAND_BACK, FLOWN, reason=HANDED_BACK),

@@ -146,7 +146,8 @@ def findings(ground: Ground) -> Iterator[tuple[str, bool, Finding]]:
             level = row.level if isinstance(row.level, Level) else row.level(ground)
             fix = row.fix if isinstance(row.fix, str) else row.fix(ground)
             yield row.check, row.at_once, Finding(level, found, fix)
-    for parameter in ground.dialect.watched_parameters if ground.dialect else ():
+    dialect = None if unfit_type(ground) else ground.dialect  # a rover's GUID_OPTIONS are others
+    for parameter in dialect.watched_parameters if dialect else ():
         name, value = parameter.name, ground.vehicle.parameters.get(parameter.name)
         fault = None if value is None else parameter.fault(value)
         if fault:

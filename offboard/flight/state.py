@@ -109,6 +109,7 @@ class FlightState(Ground):
     setpoint_s: float = math.inf  # host time of the newest setpoint; infinite before the first
     setpoints_missed_s: float = -math.inf  # newest host time with setpoints possibly missing
     rebooted: bool = False
+    returns_to: str = ""  # the pilot's mode, in which a refused vehicle is handed back
     left_engaged: bool = False  # whether an earlier flight, cut short, left the vehicle engaged
     request: Request = Request.NONE  # of the ground station, while `transitions.obey` runs
     obeyed: Request = Request.NONE  # the newest request that changed the phase
@@ -189,6 +190,12 @@ class FlightState(Ground):
         `telemetry_host_s` may be later than `host_s`, because simulated time advances within the
         turn."""
         return max(0.0, self.host_s - self.telemetry_host_s)
+
+    @property
+    def holds_in(self) -> str:
+        """The mode in which the vehicle is held or handed back."""
+        assert self.dialect is not None
+        return self.returns_to or self.dialect.hold_mode
 
     @property
     def in_the_air(self) -> bool:

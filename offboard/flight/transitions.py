@@ -19,6 +19,7 @@ from offboard.flight.phases import (
     BEFORE_FLIGHT,
     FLYING,
     TRACKING,
+    WAITING,
     ExitCode,
     Outcome,
     Phase,
@@ -101,7 +102,7 @@ def obey(flight: FlightState, request: Request, sender: str) -> bool:
         _enter(flight, row)
         flight.obeyed = request
     elif not obeyed and flight.now_s - flight.refused_s >= REFUSALS_EVERY_S:
-        starts = request is Request.START and flight.phase is Phase.STANDBY
+        starts = request is Request.START and flight.phase in WAITING
         why = starting.not_started(flight) if starts else f"not in the phase {flight.phase.value}"
         outbox.announce(flight, f"refused: {sentence}, but {why}")
         flight.refused_s = flight.now_s
@@ -230,6 +231,10 @@ def _begin_track(flight: FlightState, source: Phase) -> None:
         flight.plan.resume(flight.time_s)
 
 
+def _begin_hand_back(flight: FlightState, source: Phase) -> None:
+    flight.returns_to = flight.authority.engaged_from if source is Phase.HAND_BACK else ""
+
+
 def _begin_land(flight: FlightState, source: Phase) -> None:
     flight.touchdown = Touchdown(flight.home_ned_m if flight.took_off else None)
 
@@ -271,6 +276,7 @@ BEGINS: Mapping[Phase, Callable[[FlightState, Phase], None]] = {
     Phase.JOIN: _begin_join,
     Phase.PAUSE: _begin_pause,
     Phase.TRACK: _begin_track,
+    Phase.HAND_BACK: _begin_hand_back,
     Phase.LAND: _begin_land,
 }
 """What begins with a phase: a function of the flight and of the phase before."""

@@ -1,4 +1,4 @@
-"""Locks that allow one service for each connection and for each directory.
+"""Locks that allow one service for each vehicle on a connection and for each directory.
 
 The kernel releases a lock when the process that holds it ends, also if it was killed.
 """
@@ -72,10 +72,11 @@ def _holder(unbound: socket.socket, address: str) -> int:
     return 0
 
 
-def connection_lock(connection: str) -> AbstractContextManager[None]:
-    """The lock that allows one service for each connection, whichever user has started it."""
-    name = f"offboard-{re.sub(r'[^A-Za-z0-9.]+', '-', connection)}"[:_NAME_MAX]
-    what = f"connection {connection}"
+def connection_lock(connection: str, system_id: int | None = None) -> AbstractContextManager[None]:
+    """The lock that allows one service for each connection and `--system`, whichever user has
+    started it: a router's TCP server has many vehicles."""
+    name = f"offboard-{system_id}-{re.sub(r'[^A-Za-z0-9.]+', '-', connection)}"[:_NAME_MAX]
+    what = f"connection {connection}" + (f" --system {system_id}" if system_id else "")
     if _LINUX:
         return name_lock(name, what)
     return file_lock(Path(tempfile.gettempdir()) / f"{name}.lock", what)

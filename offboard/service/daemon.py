@@ -65,7 +65,7 @@ def run(
     before anything is sent.
     """
     with ExitStack() as stack:
-        stack.enter_context(connection_lock(vehicle.address))
+        stack.enter_context(connection_lock(vehicle.address, vehicle.system_id))
         load()  # a wrong configuration is refused before anything starts
         stack.enter_context(directory_lock(directory))
         monitor = LiveProcess("--metrics", metrics) if metrics else None

@@ -34,6 +34,11 @@ def refusing(event: str, text: str) -> Firmware:
     return replace(LEAN, rules=(rule, *LEAN.rules))
 
 
+CANNOT_HOLD = Rule(
+    "mode", when=("armed", "requests AUTO.LOITER"), result=Result.TEMPORARILY_REJECTED
+)  # as PX4 without a global position
+
+
 def with_default(name: str, value: float) -> Firmware:
     """A vehicle with another value of one parameter."""
     parameters = (

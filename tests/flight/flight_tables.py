@@ -33,6 +33,8 @@ IN_THE_AIR = FLYING | {Phase.LAND}
 def asked(row: Transition, source: Phase) -> str:
     """Return what is asked of the autopilot if `row` leaves the phase `source` in the air. Empty if
     nothing is asked although the vehicle is armed and nobody else has it."""
+    if row.target is source:
+        return "the mode that the pilot flew in before"
     if row.target in _ASKED:
         return _ASKED[row.target]
     if row.cause == "mode change":

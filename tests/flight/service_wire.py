@@ -29,6 +29,7 @@ ENGAGE = {"px4": "OFFBOARD", "ardupilot": "GUIDED"}
 HOLD = {"px4": "AUTO.LOITER", "ardupilot": "BRAKE"}
 LANDS = {"px4": "AUTO.LAND", "ardupilot": "LAND"}
 HOLD_PARAMETERS = {"px4": (4, 3), "ardupilot": (17, 0)}
+POSCTL = 3, 0  # as HOLD_PARAMETERS
 ALOFT_M = 0.3
 REPORTED_S = 0.5  # time until the service knows of a landing: EXTENDED_SYS_STATE comes at 5 Hz
 ANSWERED_S = 0.3  # longest time from a command of the pilot to the vehicle's change of mode
@@ -58,6 +59,7 @@ class Wire:
     arms: bool = False
     unsafe: list[str] = field(default_factory=list)
     mode: str = ""  # mode of the vehicle
+    before: str = ""  # its mode before the newest switch to the mode of setpoints
     changed_s: float = -math.inf  # when the vehicle changed to this mode
     engaged: bool = False  # whether the pilot engaged, and the vehicle is still in the mode
     left: bool = False  # whether a service that flew the vehicle was ended in that mode
@@ -129,6 +131,7 @@ class Wire:
             self.left = self._followed = False
             if mode == ours:
                 self.asked.clear()
+                self.before = self.mode
                 # beside another sender the pilot switches to the mode for that sender
                 alone = time_s - self._other_s > OTHER_S
                 self.engaged = alone and time_s - self._wish_s < ANSWERED_S and self._off_ground
@@ -235,13 +238,16 @@ class Wire:
 
     def _judge_command(self, message: Any) -> None:
         on, command = self.pair.firmware, message.command
-        holds = command == SET_MODE and (message.param2, message.param3) == HOLD_PARAMETERS[on]
+        asked = command == SET_MODE and (message.param2, message.param3)
+        holds = asked == HOLD_PARAMETERS[on]
+        # back to the pilot's mode after a request to hold
+        returns = asked == POSCTL and self.before == "POSCTL" and HOLD[on] in self.asked
         disarms = command == ARM and not message.param1 and not self._off_ground
         if command in QUESTIONS or (
             self.arms and command in (ARM, TAKEOFF, SET_MODE) and not holds
         ):
             return
-        if not (holds or disarms or command == LAND):
+        if not (holds or returns or disarms or command == LAND):
             self._note(f"command {command} ({message.param1:g}, {message.param2:g})")
             return
         self._served_s = self.pair.time_s
@@ -256,7 +262,7 @@ class Wire:
             if not (ours or disarms):
                 self._note(f"command {command} in {self.mode}, in which it is another's")
         if not disarms:
-            self.asked.add(HOLD[on] if holds else LANDS[on])
+            self.asked.add(self.before if returns else HOLD[on] if holds else LANDS[on])
 
     @property
     def _starved(self) -> bool:

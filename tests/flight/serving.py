@@ -4,7 +4,7 @@ companion."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from offboard.run.flight import Prepared, build
 from offboard.service.flights import Flights
 from offboard.service.preparation import VehicleFiles
 from simulator import config as simulated
+from simulator.autopilot.firmware import Rule
 from simulator.config import Start
 from simulator.instance import Instance
 
@@ -208,9 +209,11 @@ def serve(
     arms: bool = False,
     known: IdentifiedVehicle | None = None,
     aloft: bool = False,
+    rules: tuple[Rule, ...] = (),
 ) -> Serving:
     """Return a service and a vehicle, which is booting on the ground, or with `aloft` holds at 3 m
-    by its pilot. `known` are constants of it that an earlier flight identified."""
+    by its pilot. `known` are constants of it that an earlier flight identified; `rules` are more
+    rules of its firmware."""
     vehicle = "px4_sih" if on == "px4" else "arducopter"
     clock = HostClock()
     short = SHORT if reference == "hover" else ()
@@ -231,6 +234,7 @@ def serve(
 
     conditions = simulated.scenario("calm").conditions
     firmware = LEAN if on == "px4" else LEAN_COPTER
+    firmware = replace(firmware, rules=(*rules, *firmware.rules))
     instance = Instance(
         firmware,
         simulated.vehicle(firmware.vehicle),

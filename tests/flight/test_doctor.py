@@ -9,10 +9,12 @@ import threading
 import time
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+from faults import heartbeats
 from pair import HOST_EPOCH_S, OBEDIENT, Bytes, decode, frames_of
 from processes import register
 from pydantic import TypeAdapter
@@ -295,6 +297,10 @@ FOUND: list[tuple[Any, ...]] = [
     ({"firmware": ARDUPILOT, "parameters": {"GUID_OPTIONS": 2.0, "ATC_ANGLE_BOOST": 0.0}},
      ("parameters", BLOCKS, "param set GUID_OPTIONS 10$"),
      ("parameters", BLOCKS, "param set ATC_ANGLE_BOOST 1$")),
+    # the parameters of another type of vehicle mean something else
+    ({"firmware": ARDUPILOT, "parameters": {"GUID_OPTIONS": 0.0},
+      "down": partial(heartbeats(type=10), 0.0)},
+     ("vehicle", BLOCKS, "GROUND_ROVER; offboard flies multirotors"), ("parameters", OK, "")),
     ({"assignments": ["reference.period_s=1.2"]}, ("configuration", BLOCKS, "reference")),
     # in the words of ArduCopter 4.6.3
     ({"firmware": ARDUPILOT, "mode": "GUIDED", "boot_s": 9.0,

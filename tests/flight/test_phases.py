@@ -24,6 +24,7 @@ from offboard.flight.phases import (
     Action,
     ExitCode,
     Limits,
+    Outcome,
     Phase,
     Request,
     ServiceOptions,
@@ -148,6 +149,16 @@ def _identify(**values: Any) -> Setup:
     return lambda flight: vars(flight.identification).update(values)
 
 
+def _refuse_hold(flight: FlightState) -> None:
+    flight.requested_s[PX4.hold()] = (NOW_S, NOW_S)
+    hear(flight, CommandAck(176, "TEMPORARILY_REJECTED"))
+
+
+def _engage_refused(flight: FlightState) -> None:
+    """The pilot has switched from POSCTL to OFFBOARD, and was refused."""
+    flight.outcome, flight.authority.engaged_from = Outcome(ExitCode.REFUSED, ""), "POSCTL"
+
+
 # condition -> function that makes it hold
 EVENTS: dict[str, Setup] = {
     "vehicle_found": lambda flight: vars(flight.session).update(vehicle=VehicleFound(1, 1, "px4")),
@@ -156,10 +167,8 @@ EVENTS: dict[str, Setup] = {
     "only_mode_is_unfit": _all(
         _since(10.1), lambda flight: vars(flight.session).update(only_mode=True)
     ),
-    "hold_refused": lambda flight: [
-        flight.requested_s.update({PX4.hold(): (NOW_S, NOW_S)}),
-        hear(flight, CommandAck(176, "TEMPORARILY_REJECTED")),
-    ],
+    "hold_refused": _refuse_hold,
+    "refused_to_pilot": _all(_refuse_hold, _engage_refused),
     "armed_already": _all(
         partial(heartbeat, armed=True, mode="POSCTL"), _set(limits=Limits(begin_armed=False))
     ),

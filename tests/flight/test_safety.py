@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faults import disarmed, downlink, stop
+from faults import CANNOT_HOLD, disarmed, downlink, stop
 from pair import STEP_S, Bytes, Pair, with_rate
 from watch import (
     BOTH,
@@ -45,8 +45,6 @@ from offboard.flight.phases import FLYING, Action, Phase
 from offboard.identification.learner import IdentifySettings
 from offboard.mavlink.senders import HEARD_S
 from simulator import config as simulated
-from simulator.autopilot.firmware import Rule
-from simulator.autopilot.values import Result
 from simulator.config import Start
 from simulator.firmware.px4 import PX4
 
@@ -88,14 +86,7 @@ def too_heavy(pair: Pair) -> None:
 GPS_LOST = {"fault": "gps_loss", "after": "engaged", "at_s": 7.0, "drift_mps": 0.45}
 SILENT_GPS = {"fault": "silent_message", "message": "GPS_RAW_INT", "after": "engaged", "at_s": 7.0}
 OTHER = another_companion(after="engaged", at_s=7.0, setpoint_rate_hz=10, thrust=0.5)
-REFUSES_HOLD = with_rate(PX4, 50.0)
-REFUSES_HOLD = replace(
-    REFUSES_HOLD,
-    rules=(
-        Rule("mode", when=("armed", "requests AUTO.LOITER"), result=Result.TEMPORARILY_REJECTED),
-        *REFUSES_HOLD.rules,
-    ),
-)
+REFUSES_HOLD = replace(with_rate(PX4, 50.0), rules=(CANNOT_HOLD, *PX4.rules))
 AWAY = "the attitude is [0-9]+ deg away from every recent command"
 NAMED = "; another companion computer, system 1 component 194, may send setpoints, too"
 RARE = "another companion that is not heard, on PX4"

@@ -315,14 +315,25 @@ def test_the_volume_begins_at_the_take_off_point_wherever_the_pilot_engages(serv
     assert pair.state.from_takeoff_m == pytest.approx(pair.place * (1, 1, -1), abs=0.1)
 
 
-def test_service_started_in_the_air_refuses_a_vehicle_above_the_ceiling(served: Served) -> None:
-    """The take-off point was not seen; heights are above the local origin."""
-    pair = served.aloft()
+@pytest.mark.parametrize("holds", [True, False])
+def test_service_started_in_the_air_refuses_a_vehicle_above_the_ceiling(
+    served: Served, holds: bool
+) -> None:
+    """The take-off point was not seen; heights are above the local origin. A vehicle that cannot
+    hold, as without a global position, goes back to the mode that its pilot flew by sticks."""
+    pair = served.aloft(rules=() if holds else (faults.CANNOT_HOLD,))
+    pair.instance.autopilot.parameters.set("COM_RC_LOSS_T", 35.0)
+    sticks = mavlink.MAVLink_manual_control_message(1, 0, 0, 500, 0, 0)
+    pair.instance.feed_ground(sticks.pack(mavlink.MAVLink(None, srcSystem=255)))
+    pair.run(0.1)
+    pair.ground(SET_MODE, 1, 3)
+    pair.until(lambda: pair.state.vehicle.mode == "POSCTL", 2.0)
     pair.service.current.limits = Limits(ceiling_m=2.5)
     pair.switch("engage")
-    pair.run(3.0)
+    pair.until(lambda: pair.phase is Phase.HAND_BACK, 1.0)
+    pair.until(lambda: pair.phase is Phase.STANDBY, 3.0)
     assert said(pair, "not engaged: 3 m above and 0 m from the take-off point (limits.ceiling_m")
-    assert pair.state.vehicle.mode == "AUTO.LOITER"
+    assert pair.state.vehicle.mode == ("AUTO.LOITER" if holds else "POSCTL")
 
 
 def test_lost_supervisor_prevents_only_new_flights(served: Served) -> None:
@@ -398,10 +409,13 @@ def test_service_without_arms_option_stays_on_the_ground(served: Served) -> None
     pair.run(9.8)
     assert pair.phase is Phase.HEALTH
     assert said(pair, "several vehicles are heard, systems 1 and 9. Fix: choose one")
+    pair.command(START)
+    pair.run(0.1)
+    assert said(pair, "but it is on the ground, and may not be armed without --arms")
     pair.until(lambda: pair.phase is Phase.STANDBY, 1.0)
     pair.command(START)
     pair.run(3.0)
-    assert pair.acks == [(START, TEMPORARILY_REJECTED)]
+    assert pair.acks == [(START, TEMPORARILY_REJECTED)] * 2
     assert said(pair, "but it is on the ground, and may not be armed without --arms")
     assert commanded(pair, 0.0) == []
     pair.restart()

@@ -197,8 +197,8 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
     )  # fmt: skip
     assert holder.stdout is not None
     assert holder.stdout.readline() == b"held\n"
-    with connection_lock("udpin:127.0.0.1:2"):
-        pass
+    with connection_lock("udpin:127.0.0.1:2"), connection_lock("udpin:127.0.0.1:1", 2):
+        pass  # another connection, another vehicle behind the same router
     for _ in range(3):
         again = connection_lock("udpin:127.0.0.1:1")
         with pytest.raises(Unavailable, match=f"process {holder.pid}$"), again:

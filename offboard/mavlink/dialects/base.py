@@ -173,6 +173,8 @@ class Dialect:
     setpoint_loss: Callable[[Mapping[str, float]], SetpointLoss]
     # part of a STATUSTEXT that names a problem -> what the user should do about it
     remedies: Mapping[str, str] = field(default_factory=dict)
+    # modes that a pilot flies by sticks while the autopilot holds the height
+    assisted_modes: tuple[str, ...] = ()
     without_gps: str = ""  # what else the vehicle needs to fly without GPS, as an imperative
     # known defects of its firmware -> the version that fixes each, as (major, minor)
     defects: Mapping[str, tuple[int, int]] = field(default_factory=dict)

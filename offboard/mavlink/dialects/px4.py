@@ -79,6 +79,7 @@ PX4 = Dialect(
     hold_mode="AUTO.LOITER",
     land_mode="AUTO.LAND",
     return_mode="AUTO.RTL",
+    assisted_modes=("POSCTL", "ALTCTL"),
     takes_off_by_command=False,
     unused_parameter=float("nan"),  # 0 would be a valid latitude
     divides_by_tilt=False,
