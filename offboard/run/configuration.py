@@ -22,7 +22,7 @@ from pydantic import BaseModel, Field, SerializeAsAny, create_model
 from offboard.control import catalogue
 from offboard.control.base import Controller, ControllerSettings
 from offboard.documents import shipped
-from offboard.documents.errors import DocumentError, outside
+from offboard.documents.errors import DocumentError, outside, wrong_result
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, read, validate
 from offboard.documents.shipped import PARTS, locate, read_text
@@ -153,9 +153,14 @@ def build_controller(config: FlightConfig) -> Controller:
     settings = config.controller
     with outside(f"controller {settings.law}"):
         try:
-            return settings.build(config.vehicle, period_s=config.period_s, seed=config.seed)
+            built: object = settings.build(
+                config.vehicle, period_s=config.period_s, seed=config.seed
+            )
         except ValueError as error:
             raise DocumentError(f"controller {settings.law}: {error}") from error
+        if not isinstance(built, Controller):
+            raise wrong_result(settings.build, built, "a controller with decide and reset")
+    return built
 
 
 def dump(config: FlightConfig) -> str:

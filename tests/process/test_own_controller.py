@@ -90,6 +90,9 @@ def test_controller_settings_with_extra_keys_are_read_back(
                    "division by zero ("),
         ("exits", "law exits of first 1.0 (exiting:Law) cannot be used: SystemExit: 3 ("),
         ("function", "law function of first 1.0 (json:loads) cannot be used: <function loads at"),
+        ("unbuilt", "law unbuilt of first 1.0 (offboard.control.base:ControllerSettings) cannot be "
+                    "used: <class 'offboard.control.base.ControllerSettings'> is not a subclass of "
+                    "ControllerSettings with `build`"),
         ("twice", "law twice is defined twice, by first 1.0 (json:loads) and second 1.0"),
         ("nowhere", "there is no controller named 'nowhere'; known are autopilot, exits,"),
     ],
@@ -105,6 +108,7 @@ def test_broken_controller_is_refused_only_when_selected(
     register(
         site, "first", laws, gone="no_such_module:Law", raises="raising:Law", function="json:loads",
         twice="json:loads", pso="no_such_module:Law", exits="exiting:Law",
+        unbuilt="offboard.control.base:ControllerSettings",
     )  # fmt: skip
     register(site, "second", laws, twice="json:dumps")
     monkeypatch.syspath_prepend(site)
