@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any
 
 EVERY_S = 1.0  # shortest time between two sentences of a `Repeated`
-# packages in which `located` does not look for a mistake; importlib_metadata loads entry points
-_OURS = {"offboard", "importlib_metadata", *sys.stdlib_module_names}
+# packages in which `located` does not look for a mistake: importlib_metadata loads entry points,
+# pydantic calls validators
+_OURS = {"offboard", "importlib_metadata", "pydantic", *sys.stdlib_module_names}
 
 
 class UserError(Exception):

@@ -279,7 +279,8 @@ def _check_deadline(controller: Controller, cut_short: Situation, budget_s: floa
     if least_s > budget_s >= needed_s:
         raise BusyComputer(
             f"this computer is too busy: a decision needs {1e3 * needed_s:.1f} ms of its processor "
-            f"and takes {1e3 * least_s:.1f} ms; close other programs"
+            f"and takes {1e3 * least_s:.1f} ms; close other programs, and "
+            "let the controller wait for nothing"
         )
     if least_s > budget_s:
         raise DocumentError(
