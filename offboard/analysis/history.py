@@ -15,7 +15,7 @@ import numpy as np
 
 from offboard.analysis import columns
 from offboard.analysis.columns import OURS, THEIRS, Array, Rows, Samples
-from offboard.analysis.tlog import LoggedMessage, Tlog
+from offboard.analysis.tlog import OUR_COMPONENTS, LoggedMessage, Tlog
 from offboard.documents.errors import UserError
 from offboard.flight import record
 from offboard.flight.phases import Phase
@@ -24,12 +24,10 @@ from offboard.mavlink.decode import ARMED, Address
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.framing import HEARTBEAT
 from offboard.mavlink.senders import DIALECTS, dialect_of, is_vehicle
-from offboard.mavlink.session import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.mavlink.texts import TextAssembler
 from offboard.mavlink.vehicle_time import Age, VehicleTime
 from offboard.model.geodesy import Geodetic, origin_of
 
-OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
 TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
 _SUBSTITUTES = (30, 33)  # ATTITUDE, GLOBAL_POSITION_INT: the clock of logs without TELEMETRY
 _INSTEAD_OF = {
@@ -37,7 +35,6 @@ _INSTEAD_OF = {
     "GLOBAL_POSITION_INT": "LOCAL_POSITION_NED",
     "ATTITUDE_TARGET": "SET_ATTITUDE_TARGET",
 }
-_TUNNEL = 385  # message id
 PHASES: dict[int | None, str] = {phase.code: phase.value for phase in Phase}
 _NO_ATTITUDE = struct.pack("<8f", *(math.nan,) * 8)  # follows the stamp of SET_ATTITUDE_TARGET
 
@@ -138,29 +135,23 @@ class History:
 def gather(log: Tlog, *, unix_times: bool = False) -> History:
     """Read a log into a History. A log without a vehicle gives empty arrays. `unix_times`: whether
     to keep the time of the log entry of every message, not only of setpoints."""
-    collector = _Collector(*_vehicle(log), unix_times=unix_times)
+    vehicle, dialect, others = _vehicle(log)
+    collector = _Collector(vehicle, dialect, unix_times=unix_times)
     for entry in log:
         if log.damaged and math.isnan(collector.damage_s):
             collector.damage_s = collector.now_s
         collector.add(entry)
-    return collector.history(log.damage)
+    return collector.history("; ".join(filter(None, (log.damage, others))))
 
 
 def configuration(log: Tlog) -> str | None:
     """Return the configuration of the flight as YAML (see `run.configuration.flown`), None if the
     log has none. Raises UserError."""
-    pieces = (entry.tunnelled for entry in log if record_type(entry) == record.CONFIGURATION_TYPE)
+    pieces = (entry.tunnelled for entry in log if entry.record_type == record.CONFIGURATION_TYPE)
     try:
         return record.joined_configuration(pieces)
     except ValueError as error:
         raise UserError(f"{log.path}: {error}") from None
-
-
-def record_type(entry: LoggedMessage) -> int | None:
-    """Return TUNNEL.payload_type of one of our records, None for any other message."""
-    if entry.frame.message_id != _TUNNEL or entry.component_id not in OUR_COMPONENTS:
-        return None
-    return int.from_bytes(entry.frame.payload[:2], "little")
 
 
 class _Collector:
@@ -247,7 +238,7 @@ class _Collector:
             kind, payload = "SET_ATTITUDE_TARGET", payload[:4] + _NO_ATTITUDE
         elif kind == columns.ARRAY:
             kind = f"{kind} {entry.message.array_id}"
-        elif record_type(entry) == event_record.EVENT_TYPE:
+        elif entry.record_type == event_record.EVENT_TYPE:
             self._event_records.append((self.now_s, unix_s, entry.tunnelled))
         self._keep(self._ours.get(kind), payload, unix_s)
 
@@ -345,18 +336,21 @@ class _Collector:
         )
 
 
-def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:
-    """Return the vehicle that our vehicle record names, or else the first autopilot in the log."""
-    first: tuple[Address | None, Dialect | None] = (None, None)
+def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None, str]:
+    """Return the vehicle that our vehicle record names, or else the first autopilot in the log, and
+    then a sentence about the others."""
+    heard: dict[Address, Dialect | None] = {}
     for entry in log:
-        kind = entry.frame.message_id
-        if kind == HEARTBEAT and first[0] is None:
+        if entry.frame.message_id == HEARTBEAT:
             if is_vehicle(entry.message):
-                heard = Address(entry.system_id, entry.component_id)
-                first = heard, dialect_of(entry.message)
-        elif record_type(entry) == record.VEHICLE_TYPE:
+                at = Address(entry.system_id, entry.component_id)
+                heard.setdefault(at, dialect_of(entry.message))
+        elif entry.record_type == record.VEHICLE_TYPE:
             flown = record.vehicle_of(entry.tunnelled)
             if flown and flown.system_id == entry.system_id:
                 found = Address(flown.system_id, flown.component_id)
-                return found, DIALECTS.get(flown.autopilot)
-    return first
+                return found, DIALECTS.get(flown.autopilot), ""
+    first, *others = heard or [None]
+    systems = ", ".join(str(each.system_id) for each in others if each)
+    said = f"{log.path}: of several vehicles the first is used, not system {systems}"
+    return first, heard.get(first) if first else None, said if others else ""

@@ -3,7 +3,8 @@
 An entry is a big-endian uint64 of Unix microseconds, then one unchanged MAVLink frame. If the log
 ends inside an entry (after a crash), the entries before are read. Damaged entries are skipped and
 counted: reading continues where a time stamp is followed by a frame with a correct checksum and by
-another entry. A file without any entry is refused.
+another entry. A file without any entry is refused. Of several logs in one file only the first is
+read: each log of a flight begins with its configuration.
 """
 
 from __future__ import annotations
@@ -19,14 +20,18 @@ import numpy as np
 from pymavlink.dialects.v20 import all as dialect
 
 from offboard.documents.errors import UserError, abridged
+from offboard.flight.record import CONFIGURATION_TYPE
 from offboard.mavlink.framing import V1, V2, Frame, frame_size, parse
+from offboard.mavlink.session import COMPONENT_ID, RECORD_COMPONENT_ID
 
+OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
 _STAMP = struct.Struct(">Q")
 # Greatest plausible stamp. No least one: a computer without a battery-backed clock starts in 1970
 _YEAR_2100_US = 4_102_444_800_000_000
 _MARKER = re.compile(rb"[\xfd\xfe]")  # the first byte of a frame
 _LONGEST = 8 + 280  # bytes of the longest entry, with a signed MAVLink 2 frame
 _BLOCK = 1 << 20
+_TUNNEL = 385  # message id
 _TUNNEL_BYTES = 133  # payload_type, target system and component, payload_length, 128 of data
 
 
@@ -55,6 +60,18 @@ class LoggedMessage(NamedTuple):
         return self.frame.message
 
     @property
+    def record_type(self) -> int | None:
+        """TUNNEL.payload_type of one of our records, None for any other message."""
+        if self.frame.message_id != _TUNNEL or self.component_id not in OUR_COMPONENTS:
+            return None
+        return int.from_bytes(self.frame.payload[:2], "little")
+
+    @property
+    def begins_flight(self) -> bool:
+        """Whether this is the first piece of the configuration of a flight."""
+        return self.record_type == CONFIGURATION_TYPE and self.tunnelled[:2] == b"\0\0"
+
+    @property
     def tunnelled(self) -> bytes:
         """The data of a TUNNEL message, without padding."""
         payload = self.frame.payload.ljust(_TUNNEL_BYTES, b"\0")
@@ -66,23 +83,28 @@ class Tlog:
 
     After an iteration `damaged` is the number of places where entries were skipped, `first_damage`
     the offset of the first place in bytes, and `truncated` the number of bytes after the last
-    entry.
+    entry. `second_flight` is the offset of another flight, 0 if there is none.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.damaged = self.first_damage = self.truncated = 0
+        self.damaged = self.first_damage = self.truncated = self.second_flight = 0
 
     @property
     def damage(self) -> str:
-        """One sentence that says what could not be read; empty if everything could."""
-        if not self.damaged:
-            return ""
-        entries = f"{self.damaged} damaged entr{'ies were' if self.damaged > 1 else 'y was'}"
-        return f"{self.path}: {entries} skipped, the first at byte {self.first_damage}"
+        """One sentence that says what was not read; empty if everything was."""
+        said = []
+        if self.damaged:
+            entries = f"{self.damaged} damaged entr{'ies were' if self.damaged > 1 else 'y was'}"
+            said.append(f"{entries} skipped, the first at byte {self.first_damage}")
+        if self.second_flight:
+            said.append(
+                f"only the first flight is read, another begins at byte {self.second_flight}"
+            )
+        return f"{self.path}: {'; '.join(said)}" if said else ""
 
     def __iter__(self) -> Iterator[LoggedMessage]:
-        self.damaged = self.first_damage = self.truncated = 0
+        self.damaged = self.first_damage = self.truncated = self.second_flight = 0
         try:
             with self.path.open("rb") as file:
                 yield from self._messages(file)
@@ -92,7 +114,9 @@ class Tlog:
     def _messages(self, file: BinaryIO) -> Iterator[LoggedMessage]:
         data, at, before = b"", 0, 0  # `before`: offset of `data` in the file
         lost: int | None = None  # offset at which the search for the next entry began, None: none
-        found = cut = False  # `cut`: whether the length of the entry at `lost` exceeds the file
+        found = has_flight = cut = (
+            False  # `cut`: whether the length of the entry at `lost` exceeds the file
+        )
         while True:
             if at + _LONGEST + 9 > len(data) and (block := file.read(_BLOCK)):
                 before, data, at = before + at, data[at:] + block, 0
@@ -109,6 +133,11 @@ class Tlog:
                 continue
             if lost is not None:
                 self._count(lost)
+            if entry.begins_flight:
+                if has_flight:
+                    self.second_flight = before + at
+                    return
+                has_flight = True
             at += 8 + len(entry.frame.raw)
             found, lost = True, None
             yield entry

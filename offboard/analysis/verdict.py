@@ -119,10 +119,6 @@ def _ended_early(flown: History) -> tuple[str, str]:
     took_over = [event.what for event in flown.announcements if event.cause == SUPERVISOR]
     if took_over:
         return SUPERVISOR, took_over[0]
-    # The log of a service may begin with phases in which it waited
-    flight = names[names.index("climb") :] if "climb" in names else []
-    if "health" in flight or not _LANDING_ENDS.isdisjoint(flight[:-1]):
-        return "the log holds several flights", ""
     if names[-1] not in _LANDING_ENDS:
         return f"the log ends in the phase {names[-1]}", ""
     return REFERENCE_OVER if "track" in names else names[-1], ""

@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import NamedTuple, Protocol, runtime_checkable
 
+from offboard.documents.errors import shown, wrong_result
 from offboard.documents.parameters import Parameters
 from offboard.model.command import Command, PositionCommand, PredictedState
 from offboard.model.vehicle import DelayUncertainty, Vehicle
@@ -82,6 +83,12 @@ class Decision:
     command: Command | PositionCommand
     certificate: Certificate = field(default_factory=Certificate)
 
+    def __post_init__(self) -> None:
+        """Raise the error of a wrong type here, where the law makes its decision."""
+        if not isinstance(self.command, Command | PositionCommand):
+            raise TypeError(f"{shown(self.command)} is no Command and no PositionCommand")
+        [float(figure) for figure in astuple(self.certificate)]  # as the log will have them
+
 
 class DecisionError(ArithmeticError):
     """`Controller.decide` found no command, for example because the state is not finite.
@@ -90,6 +97,7 @@ class DecisionError(ArithmeticError):
     """
 
 
+@runtime_checkable
 class Controller(Protocol):
     """A control law. The flight calls these two methods, and those of `Adaptive` if it has them.
 
@@ -110,6 +118,14 @@ class Controller(Protocol):
     def reset(self) -> None:
         """Return to the state after construction: no memory, and the random stream at its seed."""
         ...
+
+
+def decision_of(controller: Controller, situation: Situation) -> Decision:
+    """Let the controller decide. Raises DocumentError if it returns no Decision."""
+    decision: object = controller.decide(situation)
+    if not isinstance(decision, Decision):
+        raise wrong_result(controller.decide, decision, "a Decision")
+    return decision
 
 
 class ControllerSettings(Parameters, ABC):

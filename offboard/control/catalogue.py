@@ -9,6 +9,8 @@ is imported when it is requested, so that a flight loads and compiles only what 
 from __future__ import annotations
 
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
+from inspect import isabstract
+from typing import cast
 
 from offboard.control.base import ControllerSettings
 from offboard.documents.errors import DocumentError, outside
@@ -51,10 +53,11 @@ def settings_of(law: str) -> type[ControllerSettings]:
     unusable = f"law {entry.name} of {_described(entry)} cannot be used"
     with outside(unusable):
         loaded = entry.load()
-    if not (isinstance(loaded, type) and issubclass(loaded, ControllerSettings)):
-        sentence = f"{unusable}: {loaded!r} is not a subclass of ControllerSettings"
+    is_settings = isinstance(loaded, type) and issubclass(loaded, ControllerSettings)
+    if not is_settings or isabstract(loaded):
+        sentence = f"{unusable}: {loaded!r} is not a subclass of ControllerSettings with `build`"
         raise DocumentError(" ".join(sentence.split()))
-    return loaded
+    return cast(type[ControllerSettings], loaded)
 
 
 def _described(entry: EntryPoint) -> str:

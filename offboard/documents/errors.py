@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any
 
 EVERY_S = 1.0  # shortest time between two sentences of a `Repeated`
-# packages in which `located` does not look for a mistake; importlib_metadata loads entry points
-_OURS = {"offboard", "importlib_metadata", *sys.stdlib_module_names}
+# packages in which `located` does not look for a mistake: importlib_metadata loads entry points,
+# pydantic calls validators
+_OURS = {"offboard", "importlib_metadata", "pydantic", *sys.stdlib_module_names}
 
 
 class UserError(Exception):
@@ -51,7 +52,9 @@ class DocumentError(UserError):
 def located(error: BaseException) -> str:
     """Format an exception of external code, such as a controller, as one sentence with the file and
     line of the mistake. That is the innermost call inside the package or folder that our code
-    called. Reads no file and never raises."""
+    called. The sentence of a UserError is complete. Reads no file and never raises."""
+    if isinstance(error, UserError):
+        return str(error)
     calls = []  # package, folder, place
     for frame, line in traceback.walk_tb(error.__traceback__):
         package = str(frame.f_globals.get("__name__")).partition(".")[0]
@@ -74,6 +77,15 @@ def naming(source: str) -> Iterator[None]:
         yield
     except DocumentError as error:
         raise DocumentError(*(f"{source}: {each}" for each in error.problems)) from None
+
+
+def wrong_result(function: Any, result: object, wanted: str) -> DocumentError:
+    """The error for a function of external code that returns `result` instead of `wanted`. It has
+    the file and line of the function."""
+    code = getattr(function, "__code__", None)
+    place = f" ({code.co_filename}:{code.co_firstlineno})" if code else ""
+    name = getattr(function, "__qualname__", type(function).__name__)
+    return DocumentError(f"{name} returns {abridged(repr(result))}, not {wanted}{place}")
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from dataclasses import astuple
 from operator import sub
 
 from offboard.control.bandwidth import tilting_bandwidth
-from offboard.control.base import Adaptive, Situation
+from offboard.control.base import Adaptive, Situation, decision_of
 from offboard.documents.errors import located
 from offboard.flight import failsafe, outbox
 from offboard.flight.outbox import Refused
@@ -151,7 +151,7 @@ def _decided(flight: FlightState) -> Decided:
         origin_ned_m=plan.origin_ned_m,
         track_time_s=plan.track_time_s(time_s),
     )
-    decision = flight.controller.decide(situation)
+    decision = decision_of(flight.controller, situation)
     return Decided(flight.phase, state, decision, flight.stopwatch() - began_s)
 
 

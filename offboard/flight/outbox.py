@@ -10,6 +10,9 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
+from dataclasses import astuple
+from numbers import Real
+from typing import Any
 
 from offboard.flight.phases import TRACKING, ExitCode, Phase
 from offboard.flight.record import Refusal
@@ -86,16 +89,21 @@ def admit(
 
 
 def usable(command: Command | PositionCommand) -> bool:
-    """Whether float32 can hold all values and the thrust direction is a unit vector. It must be a
-    tuple, because commands are compared with ==."""
+    """Whether all values are numbers that float32 can hold, and the thrust direction is a unit
+    vector. Vectors must be tuples, because commands are compared with ==."""
+    # lengths of the fields; 0: a number
+    lengths = (3, 3, 3, 0, 0) if isinstance(command, PositionCommand) else (0, 3, 0)
+    numbers: list[Any] = []
+    for value, length in zip(astuple(command), lengths, strict=True):
+        if length and not (isinstance(value, tuple) and len(value) == length):
+            return False
+        numbers += value if length else [value]
+    if not all(isinstance(each, Real) for each in numbers):
+        return False
+    if not all(abs(each) <= FLOAT32_MAX for each in numbers):
+        return False
     if isinstance(command, PositionCommand):
-        return all(abs(value) <= FLOAT32_MAX for value in command.numbers())
-    direction: object = command.thrust_direction_ned
-    if not isinstance(direction, tuple):
-        return False
-    values = (command.thrust_mps2, *command.thrust_direction_ned, command.heading_rad)
-    if not all(abs(value) <= FLOAT32_MAX for value in values):
-        return False
+        return True
     return abs(math.hypot(*command.thrust_direction_ned) - 1.0) <= _LENGTH_TOLERANCE
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from offboard.analysis import history, tlog
-from offboard.analysis.history import record_type
 from offboard.analysis.tlog import LoggedMessage, Tlog
 from offboard.documents.errors import UserError
 from offboard.documents.signing_key import KEY_BYTES
@@ -69,7 +68,7 @@ def read(flight: Path) -> Recording:
             f"{path} does not hold the configuration of a flight: only logs of offboard can be "
             "replayed"
         )
-    recorded = tuple(m.tunnelled for m in log if record_type(m) == INPUTS_TYPE)
+    recorded = tuple(m.tunnelled for m in log if m.record_type == INPUTS_TYPE)
     if not recorded:
         raise UserError(
             f"{path} cannot be replayed, only scored and reported: it has no inputs of each turn; "

@@ -88,7 +88,7 @@ def read(path: Path) -> Flight:
             missing.append(f"no {usual}: the {what} is that of {substitute}{how}")
     if flown.damage:
         at = "" if math.isnan(flown.damage_s) else f", at {flown.damage_s:.2f} s of vehicle time"
-        missing.append(f"damaged log: {flown.damage}{at}")
+        missing.append(f"{flown.damage}{at}")
     if log.truncated:
         missing.append(
             f"the log ends within an entry, at byte {log.path.stat().st_size - log.truncated}"

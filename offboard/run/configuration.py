@@ -22,7 +22,7 @@ from pydantic import BaseModel, Field, SerializeAsAny, create_model
 from offboard.control import catalogue
 from offboard.control.base import Controller, ControllerSettings
 from offboard.documents import shipped
-from offboard.documents.errors import DocumentError, outside
+from offboard.documents.errors import DocumentError, outside, wrong_result
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, read, validate
 from offboard.documents.shipped import PARTS, locate, read_text
@@ -153,9 +153,14 @@ def build_controller(config: FlightConfig) -> Controller:
     settings = config.controller
     with outside(f"controller {settings.law}"):
         try:
-            return settings.build(config.vehicle, period_s=config.period_s, seed=config.seed)
+            built: object = settings.build(
+                config.vehicle, period_s=config.period_s, seed=config.seed
+            )
         except ValueError as error:
             raise DocumentError(f"controller {settings.law}: {error}") from error
+        if not isinstance(built, Controller):
+            raise wrong_result(settings.build, built, "a controller with decide and reset")
+    return built
 
 
 def dump(config: FlightConfig) -> str:
@@ -163,7 +168,8 @@ def dump(config: FlightConfig) -> str:
     versions of Python and of the packages that affect a flight."""
     packages = " ".join(f"{name} {version(name)}" for name in RECORDED_VERSIONS)
     heading = f"# Resolved configuration. {packages}, Python {platform.python_version()}\n"
-    document = config.model_dump(mode="json", exclude_none=True)
+    with outside("the configuration cannot be recorded"):
+        document = config.model_dump(mode="json", exclude_none=True)
     return heading + yaml.safe_dump(document, sort_keys=False)
 
 
@@ -183,7 +189,8 @@ def _validated(raw: Raw, source: str, extra: Literal["ignore"] | None = None) ->
     models = {part: _model(part, raw.get(part), f"{source}: {part}") for part in PARTS}
     parts: dict[str, Any] = {part: (model, ...) for part, model in models.items()}
     model = create_model("FlightConfig", __base__=FlightConfig, **parts)
-    return FlightConfig(**dict(validate(raw, model, source, extra)))
+    with outside(source):  # validators of a control law
+        return FlightConfig(**dict(validate(raw, model, source, extra)))
 
 
 def _complete(config: FlightConfig) -> FlightConfig:
@@ -218,7 +225,8 @@ def read_part(part: str, name: str) -> Raw:
         return {"law": name}
     path = locate(name, part, laws)
     raw = read(read_text(path), str(path), part)
-    validate(raw, _model(part, raw, str(path)), str(path))
+    with outside(str(path)):
+        validate(raw, _model(part, raw, str(path)), str(path))
     if raw.get("shape") == "table":
         raw["file"] = str(path.parent / raw["file"])
     return raw

@@ -16,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 
 from offboard.compiled import prepare
-from offboard.control.base import Adaptive, Controller, Situation
+from offboard.control.base import Adaptive, Controller, Situation, decision_of
 from offboard.documents.errors import DocumentError, Unavailable, outside
 from offboard.documents.shipped import absolute
 from offboard.documents.signing_key import read_key
@@ -255,14 +255,11 @@ def _decided(controller: Controller, situation: Situation) -> Command | Position
     a command that cannot be sent, or changes the given state."""
     given = deepcopy(situation.state)
     with outside("controller"):
-        decision = controller.decide(situation)
-        command = decision.command
-        [float(figure) for figure in astuple(decision.certificate)]  # as the log will have them
-        may_be_sent = usable(command)
-    if not may_be_sent:
+        command = decision_of(controller, situation).command
+    if not usable(command):
         raise DocumentError(
-            f"controller: it decides {command}, which cannot be sent: all values must be finite, "
-            "the thrust direction a tuple of length 1"
+            f"controller: it decides {command}, which cannot be sent: all values must be finite "
+            "numbers, vectors tuples of three, and the thrust direction of length 1"
         )
     # the flight compares the given state with the motion that follows
     if not all(map(np.array_equal, astuple(situation.state), astuple(given))):
@@ -282,7 +279,8 @@ def _check_deadline(controller: Controller, cut_short: Situation, budget_s: floa
     if least_s > budget_s >= needed_s:
         raise BusyComputer(
             f"this computer is too busy: a decision needs {1e3 * needed_s:.1f} ms of its processor "
-            f"and takes {1e3 * least_s:.1f} ms; close other programs"
+            f"and takes {1e3 * least_s:.1f} ms; close other programs, and "
+            "let the controller wait for nothing"
         )
     if least_s > budget_s:
         raise DocumentError(

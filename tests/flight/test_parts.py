@@ -41,6 +41,22 @@ def with_an_array(_: Situation) -> Decision:
     return Decision(replace(LEVEL, thrust_direction_ned=np.array(LEVEL.thrust_direction_ned)))
 
 
+def with_two_numbers(_: Situation) -> Decision:
+    return Decision(replace(LEVEL, thrust_direction_ned=(0.0, 1.0)))  # type: ignore[arg-type]
+
+
+def with_text(_: Situation) -> Decision:
+    return Decision(replace(LEVEL, thrust_mps2="9.8"))  # type: ignore[arg-type]
+
+
+def without_a_command(_: Situation) -> Decision:
+    return Decision((9.8, (0.0, 0.0, 1.0), 0.0))  # type: ignore[arg-type]
+
+
+def without_a_decision(_: Situation) -> Command:
+    return LEVEL
+
+
 def changing_its_input(situation: Situation) -> Decision:
     """Compute the error from the reference in place, which changes the state."""
     position_ned_m = situation.state.position_ned_m
@@ -60,11 +76,15 @@ def without_a_text(_: Situation) -> Decision:
     ("fail", "says"),
     [
         (with_an_array, r"controller: it decides Command.*array.*, which cannot be sent"),
+        (with_two_numbers, "controller: it decides Command.*, which cannot be sent"),
+        (with_text, "controller: it decides Command.*, which cannot be sent"),
+        (without_a_command, r"TypeError: \(9.8, .*\) is no Command .*\(.*test_parts\.py:\d+\)"),
+        (without_a_decision, r"returns Command\(.*, not a Decision \(.*\.py:\d+\)"),
         (changing_its_input, "controller: it changes the state that it is given; let it use a"),
         (without_a_text, r"controller: Unprintable: it cannot be printed \(.*test_parts\.py:\d+\)"),
         (raises, r"controller: ZeroDivisionError: nothing to divide by \(.*faults\.py:\d+\)"),
         (no_direction, "controller: it decides Command.*, which cannot be sent"),
-        (without_cost, r"controller: TypeError: .*float\(\)"),
+        (without_cost, r"controller: TypeError: .*float\(\).* \(.*test_parts\.py:\d+\)"),
     ],
 )
 def test_rehearsal_finds_a_failing_law(fail: Any, says: str) -> None:

@@ -257,6 +257,14 @@ def test_home_position_is_the_origin_only_without_global_origin(
     assert row["position_ned_m"] == pytest.approx([north_m, 0.0, 0.0], abs=0.01)
 
 
+def test_second_vehicle_in_a_foreign_log_is_named(tmp_path: Path, recorded: Flight) -> None:
+    other = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(mavlink.MAVLink(None, 9, 1))
+    log = tmp_path / "two.tlog"
+    log.write_bytes(PX4.read_bytes() + STAMP + other)
+    said = f"{log}: of several vehicles the first is used, not system 9"
+    assert set(read(log).missing) == {*recorded.missing, said}
+
+
 def test_report_names_the_place_of_log_damage(tmp_path: Path, recorded: Flight) -> None:
     data = bytearray(PX4.read_bytes())
     at = len(data) // 2
@@ -264,7 +272,7 @@ def test_report_names_the_place_of_log_damage(tmp_path: Path, recorded: Flight) 
     damaged = tmp_path / "damaged.tlog"
     damaged.write_bytes(data[:-5])
     flight = read(damaged)
-    (said,) = (each for each in flight.missing if each.startswith("damaged log"))
+    (said,) = (each for each in flight.missing if "damaged entry" in each)
     found = re.search(r"the first at byte (\d+), at ([0-9.]+) s", said)
     assert found
     assert at - 300 < int(found[1]) <= at

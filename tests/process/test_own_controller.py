@@ -69,8 +69,11 @@ def test_controller_settings_with_extra_keys_are_read_back(
 ) -> None:
     """A replay once decided without such settings. One that no longer exists is still dropped."""
     (tmp_path / "anything.py").write_text(
+        "from pydantic import model_validator\n"
         "from offboard.control.base import ControllerSettings\n\n\n"
         "class Settings(ControllerSettings, extra='allow'):\n    law: str = 'any'\n\n"
+        "    @model_validator(mode='before')\n    @classmethod\n    def check(cls, given):\n"
+        "        return {}['none'] if 'broken' in given else given\n\n"
         "    def build(self, vehicle, *, period_s, seed): ...\n"
     )
     register(tmp_path, "first", "pso_offboard.controllers", any="anything:Settings")
@@ -78,6 +81,11 @@ def test_controller_settings_with_extra_keys_are_read_back(
     config = load("flight", choices={"controller": "any"}, assignments=["controller.gain=3.5"])
     text = dump(config)
     assert flown(text) == config
+    with pytest.raises(DocumentError, match=r"flight.yaml: KeyError: 'none' \(.*anything.py:11\)"):
+        load("flight", choices={"controller": "any"}, assignments=["controller.broken=1"])
+    unknown = config.controller.model_copy(update={"gain": object()})
+    with pytest.raises(DocumentError, match=r"the configuration cannot be recorded: .*Unable to"):
+        dump(config.model_copy(update={"controller": unknown}))
     assert flown(text.replace("limits:\n", "limits:\n  gone_s: 1.0\n")).limits == config.limits
 
 
@@ -90,6 +98,9 @@ def test_controller_settings_with_extra_keys_are_read_back(
                    "division by zero ("),
         ("exits", "law exits of first 1.0 (exiting:Law) cannot be used: SystemExit: 3 ("),
         ("function", "law function of first 1.0 (json:loads) cannot be used: <function loads at"),
+        ("unbuilt", "law unbuilt of first 1.0 (offboard.control.base:ControllerSettings) cannot be "
+                    "used: <class 'offboard.control.base.ControllerSettings'> is not a subclass of "
+                    "ControllerSettings with `build`"),
         ("twice", "law twice is defined twice, by first 1.0 (json:loads) and second 1.0"),
         ("nowhere", "there is no controller named 'nowhere'; known are autopilot, exits,"),
     ],
@@ -105,6 +116,7 @@ def test_broken_controller_is_refused_only_when_selected(
     register(
         site, "first", laws, gone="no_such_module:Law", raises="raising:Law", function="json:loads",
         twice="json:loads", pso="no_such_module:Law", exits="exiting:Law",
+        unbuilt="offboard.control.base:ControllerSettings",
     )  # fmt: skip
     register(site, "second", laws, twice="json:dumps")
     monkeypatch.syspath_prepend(site)

@@ -16,8 +16,8 @@ from pair import SHORT, UNIX_EPOCH_US, HostClock, Pair, hover, in_phase
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner, Result
 
-from offboard.analysis import tlog
-from offboard.analysis.history import record_type
+from offboard.analysis import history, tlog
+from offboard.analysis.score import score
 from offboard.cli.commands import app
 from offboard.control.base import Controller, Decision, Situation
 from offboard.control.law import PsoLaw
@@ -131,8 +131,8 @@ def test_float_rounding_is_not_a_significant_difference(by: float, significant: 
 
 def test_logs_without_needed_records_are_refused(flight: Path, tmp_path: Path) -> None:
     old, silent = tmp_path / "old.tlog", tmp_path / "silent.tlog"
-    old.write_bytes(without(flight, lambda message: record_type(message) == INPUTS_TYPE))
-    silent.write_bytes(without(flight, lambda message: record_type(message) is None))
+    old.write_bytes(without(flight, lambda message: message.record_type == INPUTS_TYPE))
+    silent.write_bytes(without(flight, lambda message: message.record_type is None))
     for log, why in (
         (WIRE / "px4-1.16.1-offboard.tlog", "does not hold the configuration"),
         (old, "has no inputs of each turn"),
@@ -171,6 +171,17 @@ def test_comparison_ends_before_a_lost_message(failed: Pair, tmp_path: Path) -> 
     assert not comparison.differences
     assert 30 < comparison.setpoints < len(failed.payloads)
     assert replay.ended_s == pytest.approx(lost_ms / 1e3, abs=0.3)
+
+
+def test_second_flight_in_a_log_is_named_and_not_read(flight: Path, tmp_path: Path) -> None:
+    """Regression: the replay ended with "piece 232 is missing", and a score mixed both flights."""
+    data, both = flight.read_bytes(), tmp_path / "both.tlog"
+    both.write_bytes(data + data)
+    one, two = (run(path) for path in (flight, both))
+    assert (two.exit_code, two.stdout) == (one.exit_code, one.stdout)
+    assert f"only the first flight is read, another begins at byte {len(data)}" in two.stderr
+    scores = [score(history.gather(tlog.read(path))) for path in (flight, both)]
+    assert repr(scores[0]) == repr(scores[1])  # with NaN
 
 
 # ------------------------------------------------------------------ unusual inputs
