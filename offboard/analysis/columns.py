@@ -224,7 +224,7 @@ def _within_limits(rows: Rows) -> NDArray[np.bool_]:
     known = rows.dtype.names or ()
     kept = [(np.abs(rows[name]) < _LIMITS[name]).all(axis=1) for name in _LIMITS if name in known]
     if "quaternion" in known:
-        lengths = np.linalg.norm(rows["quaternion"], axis=1)
+        lengths = np.linalg.norm(rows["quaternion"].astype(np.float64), axis=1)
         kept += [lengths > UNIT_LENGTHS[0], lengths < UNIT_LENGTHS[1]]
     within: NDArray[np.bool_] = np.logical_and.reduce(kept)
     return within

@@ -203,7 +203,8 @@ def test_foreign_senders_and_impossible_values_have_no_effect(flown: History) ->
     ]
     frames = [each.pack(mavlink.MAVLink(None, *ids)) for *ids, each in others]
     turns, wrong = count(), [
-        {"y": math.nan}, {"y": -3.4e38}, {"vz": math.inf}, {"time_boot_ms": 2**31}, {"q2": math.nan}
+        {"y": math.nan}, {"y": -3.4e38}, {"vz": math.inf}, {"time_boot_ms": 2**31},
+        {"q2": math.nan}, {"q2": 3e38},
     ]  # fmt: skip
 
     def among(_: float, heard: list[bytes]) -> list[bytes]:
