@@ -62,7 +62,7 @@ class InMemoryVehicle:
     @staticmethod
     def check_scenario(text: str, source: str) -> None:
         """Check the YAML text of a scenario. `source` names it in errors. Raises DocumentError."""
-        parse(text, config.Scenario, source)
+        parse(text, config.Scenario, source, "scenario")
 
     def exchange(self, frames: Sequence[bytes]) -> list[tuple[int, bytes]]:
         """Handle frames of the companion; if they answer the present barrier, advance to the next.

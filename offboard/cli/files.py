@@ -38,8 +38,9 @@ def _checked(path: Path) -> str:
     """Validate a file and return the sentence for a valid one. The vehicle of the default
     configuration must be able to fly a reference; that of a configuration must be able to fly its
     reference. Raises DocumentError."""
-    from offboard.campaign.cases import base_cases
+    from offboard.campaign.cases import expand
     from offboard.campaign.document import CampaignFile
+    from offboard.campaign.run import check as check_cases
     from offboard.campaign.tune import TuneFile, planned
     from offboard.documents.reading import kind_of, load_document, read
     from offboard.run.configuration import build_track, load, read_part
@@ -66,7 +67,7 @@ def _checked(path: Path) -> str:
     elif kind == "campaign":
         campaign, source = load_document(name, "campaign", CampaignFile)
         with naming(source):
-            list(base_cases(campaign))
+            check_cases(expand(campaign))
     else:
         raise DocumentError(
             f"{path}: no key says what it is: a vehicle has mass_kg, a controller law, a reference "

@@ -241,5 +241,6 @@ def _model(part: str, raw: object, source: str) -> type[BaseModel]:
     named = raw.get(key) if isinstance(raw, dict) else None
     if named not in known:
         problem = f"{key}: {named!r} is not one of" if named else f"{key} is missing; known are"
-        raise DocumentError(f"{source}: {problem} {', '.join(known)}")
+        place = getattr(raw, "places", {}).get(key, source)
+        raise DocumentError(f"{place}: {problem} {', '.join(known)}")
     return catalogue.settings_of(named) if part == "controller" else SHAPES[named]
