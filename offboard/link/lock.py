@@ -73,10 +73,11 @@ def _holder(unbound: socket.socket, address: str) -> int:
 
 
 def connection_lock(connection: str, system_id: int | None = None) -> AbstractContextManager[None]:
-    """The lock that allows one service for each connection and `--system`, whichever user has
-    started it: a router's TCP server has many vehicles."""
-    name = f"offboard-{system_id}-{re.sub(r'[^A-Za-z0-9.]+', '-', connection)}"[:_NAME_MAX]
-    what = f"connection {connection}" + (f" --system {system_id}" if system_id else "")
+    """The lock that allows one service for each connection, whichever user has started it. On a
+    connection to a TCP server it allows one for each `--system`: a router has many vehicles."""
+    which = f"{system_id or 0}-" if connection.startswith("tcp:") else ""
+    name = f"offboard-{which}{re.sub(r'[^A-Za-z0-9.]+', '-', connection)}"[:_NAME_MAX]
+    what = f"connection {connection}" + (f" --system {system_id}" if which and system_id else "")
     if _LINUX:
         return name_lock(name, what)
     return file_lock(Path(tempfile.gettempdir()) / f"{name}.lock", what)

@@ -187,7 +187,7 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
         "import os, sys\n"
         "from offboard.link.lock import connection_lock\n"
         "if os.getuid() == 0: os.setuid(65534)\n"
-        "with connection_lock('udpin:127.0.0.1:1'):\n"
+        "with connection_lock('udpin:127.0.0.1:1'), connection_lock('tcp:127.0.0.1:1', 1):\n"
         "    print('held', flush=True)\n"
         "    sys.stdin.read()\n"
     )
@@ -197,10 +197,10 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
     )  # fmt: skip
     assert holder.stdout is not None
     assert holder.stdout.readline() == b"held\n"
-    with connection_lock("udpin:127.0.0.1:2"), connection_lock("udpin:127.0.0.1:1", 2):
+    with connection_lock("udpin:127.0.0.1:2"), connection_lock("tcp:127.0.0.1:1", 2):
         pass  # another connection, another vehicle behind the same router
-    for _ in range(3):
-        again = connection_lock("udpin:127.0.0.1:1")
+    for held in (("udpin:127.0.0.1:1",), ("udpin:127.0.0.1:1", 2), ("tcp:127.0.0.1:1", 1)):
+        again = connection_lock(*held)
         with pytest.raises(Unavailable, match=f"process {holder.pid}$"), again:
             pass
     holder.kill()
