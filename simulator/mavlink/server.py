@@ -148,6 +148,12 @@ class Server:
     def _set_mode(self, message: Message) -> None:
         self._commands.set_mode(message.base_mode, message.custom_mode, sender_of(message))
 
+    def _set_parameter(self, message: Message) -> None:
+        """PARAM_SET, which is answered on all links."""
+        if self._parameters.set(message):
+            for link in (self, *self.others):
+                link._parameters.show(message.param_id)
+
     def _mission_item(self, message: Message) -> None:
         if not (self.view.autopilot.firmware.home_item_first and message.current == _GUIDED):
             self._missions.item(message)
@@ -256,7 +262,7 @@ HANDLERS: dict[str, Callable[[Server, Message], None]] = {
     "SET_GPS_GLOBAL_ORIGIN": Server._set_origin,
     "PARAM_REQUEST_READ": lambda server, message: server._parameters.request_read(message),
     "PARAM_REQUEST_LIST": lambda server, message: server._parameters.request_list(message),
-    "PARAM_SET": lambda server, message: server._parameters.set(message),
+    "PARAM_SET": Server._set_parameter,
     "RC_CHANNELS_OVERRIDE": Server._rc_channels_override,
     "MANUAL_CONTROL": Server._manual_control,
     "SETUP_SIGNING": Server._setup_signing,

@@ -32,10 +32,10 @@ class ParameterTransfer:
         if not self._due:
             return
         for name in self._due[:PER_STEP]:
-            self._answer(name, listed=True)
+            self.show(name, listed=True)
         del self._due[:PER_STEP]
 
-    def _answer(self, name: str, *, listed: bool = False) -> None:
+    def show(self, name: str, *, listed: bool = False) -> None:
         """Queue PARAM_VALUE. `listed`: whether it is part of a list or was requested by index."""
         autopilot = self.outbox.view.autopilot
         if name == HASH:
@@ -53,9 +53,9 @@ class ParameterTransfer:
         names = self.outbox.view.autopilot.parameters.names
         if message.param_index >= 0:
             if message.param_index < len(names):
-                self._answer(names[message.param_index], listed=True)
+                self.show(names[message.param_index], listed=True)
         elif message.param_id in names or self._is_hash(message.param_id):
-            self._answer(message.param_id)
+            self.show(message.param_id)
 
     def _is_hash(self, name: str) -> bool:
         return name == HASH and self.outbox.view.autopilot.firmware.parameters_hashed
@@ -65,13 +65,12 @@ class ParameterTransfer:
         hashed = (HASH,) if self._is_hash(HASH) and not self._due else ()
         self._due = [*hashed, *self.outbox.view.autopilot.parameters.names]
 
-    def set(self, message: Message) -> None:
-        """Handle PARAM_SET; the answer contains the parameter's value after it."""
+    def set(self, message: Message) -> bool:
+        """Handle PARAM_SET. Returns whether it is answered, with the parameter's value after it."""
         table = self.outbox.view.autopilot.parameters
         if self._is_hash(message.param_id):  # the client has the whole list and wants no more
             self._due = []
-        if table.set_from_wire(message.param_id, message.param_value, message.param_type):
-            self._answer(message.param_id)
+        return table.set_from_wire(message.param_id, message.param_value, message.param_type)
 
 
 REPEAT_S, GIVE_UP_S = 0.25, 5.0

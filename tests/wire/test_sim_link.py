@@ -188,6 +188,17 @@ def test_px4_has_the_parameters_that_examples_of_mavsdk_set(name: bytes) -> None
     asked(bench, name)
 
 
+def test_a_changed_parameter_is_reported_on_every_link() -> None:
+    """As by PX4 1.16 and ArduPilot: a companion computer hears of what a ground station changes."""
+    bench = Bench(ground_link=True)
+    ground = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+    value = mavlink.MAVLink_param_set_message(1, 1, b"MPC_THR_HOVER", 0.4, 9)
+    bench.instance.feed_ground(value.pack(ground))
+    bench.run(0.1)
+    ((_, shown),) = bench.of("PARAM_VALUE")
+    assert (shown.param_id, shown.param_value) == ("MPC_THR_HOVER", pytest.approx(0.4))
+
+
 def test_the_parameter_hash_changes_with_the_values() -> None:
     """QGroundControl reads the hash; a client that knows it stops the list of parameters."""
     bench = Bench()
