@@ -114,9 +114,8 @@ class Tlog:
     def _messages(self, file: BinaryIO) -> Iterator[LoggedMessage]:
         data, at, before = b"", 0, 0  # `before`: offset of `data` in the file
         lost: int | None = None  # offset at which the search for the next entry began, None: none
-        found = has_flight = cut = (
-            False  # `cut`: whether the length of the entry at `lost` exceeds the file
-        )
+        found = has_flight = False
+        cut = False  # whether the length of the entry at `lost` exceeds the file
         while True:
             if at + _LONGEST + 9 > len(data) and (block := file.read(_BLOCK)):
                 before, data, at = before + at, data[at:] + block, 0
