@@ -12,6 +12,8 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
+from pydantic import TypeAdapter
+
 from offboard.documents import shipped
 from offboard.documents.errors import UserError
 from offboard.link.log import replace_file
@@ -48,6 +50,9 @@ class Record:
         return self.margin < 0.0 and not self.infeasible
 
 
+_RECORD = TypeAdapter(Record)
+
+
 class Results:
     """The results in a directory that were flown by one code, given by its hash.
 
@@ -74,9 +79,8 @@ class Results:
     def get(self, key: str) -> Record | None:
         """Return the record of a finished case, else None."""
         try:
-            raw = json.loads((self._folder / f"{key}.json").read_text(encoding="utf-8"))
-            return Record(**raw)
-        except (OSError, ValueError, TypeError):
+            return _RECORD.validate_json((self._folder / f"{key}.json").read_bytes())
+        except (OSError, ValueError):
             return None
 
     def put(self, key: str, record: Record) -> None:

@@ -334,6 +334,8 @@ def test_campaign_resumes_after_a_full_disk(
     stamp = kept.stat().st_mtime_ns
     assert fly(campaign(FILE, tmp_path / "out"), partial(local_workers, 1)).missing == 0
     assert kept.stat().st_mtime_ns == stamp  # none is flown twice
+    kept.write_text(json.dumps({**json.loads(kept.read_text()), "margin": "wide"}))
+    assert fly(campaign(FILE, tmp_path / "out"), partial(local_workers, 1)).missing == 0
     assert table(tmp_path / "out") == table(whole)
 
 

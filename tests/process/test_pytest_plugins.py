@@ -118,15 +118,33 @@ def test_vehicle_ends_with_a_pytest_that_crashes(pytester: pytest.Pytester) -> N
         pytest.fail("the vehicle still runs")
 
 
-def test_ctrl_c_in_a_flight_ends_pytest(fly: Callable[..., Flight], tmp_path: Path) -> None:
-    def press() -> None:
-        while not (tmp_path / "flight-1" / "flight.tlog").exists():
-            time.sleep(0.01)
-        os.kill(os.getpid(), signal.SIGINT)
+def test_ctrl_c_and_a_timeout_in_a_flight_end_the_test(
+    fly: Callable[..., Flight], tmp_path: Path
+) -> None:
+    """pytest-timeout raises its exception in a handler of SIGALRM."""
 
-    threading.Thread(target=press, daemon=True).start()
-    with pytest.raises(KeyboardInterrupt):
-        fly(must_succeed=False)
+    def times_out(*_: object) -> None:
+        pytest.fail("it takes too long")
+
+    def send(number: int, flight: Path) -> None:
+        log = flight / "flight.tlog"
+        while not log.exists() or log.stat().st_size < 100_000:  # some seconds of a flight
+            time.sleep(0.01)
+        os.kill(os.getpid(), number)
+
+    before = signal.signal(signal.SIGALRM, times_out)
+    for count, (number, ending, says) in enumerate(
+        (
+            (signal.SIGINT, KeyboardInterrupt, None),
+            (signal.SIGALRM, pytest.fail.Exception, "^it takes too long$"),
+        ),
+        1,
+    ):
+        arguments = (number, tmp_path / f"flight-{count}")
+        threading.Thread(target=send, args=arguments, daemon=True).start()
+        with pytest.raises(ending, match=says):
+            fly(must_succeed=False)
+    signal.signal(signal.SIGALRM, before)
 
 
 def test_plugins_import_no_heavy_modules_in_other_suites(pytester: pytest.Pytester) -> None:
