@@ -16,6 +16,8 @@ from offboard.reference.track import Track
 Array = NDArray[np.float64]
 
 HEIGHT_MIN_M, DISTANCE_MAX_M, SPEED_MAX_MPS = 0.3, 2000.0, 12.0
+# Of roll and pitch. The shipped references need 2; more than 50 is noise of dense, rounded rows
+TILTING_MAX_RADPS2 = 50.0
 # Shares of the vehicle's limits that a reference may use; the rest is reserved for feedback
 THRUST_SHARE_MIN, THRUST_SHARE_MAX, TILT_SHARE_MAX = 0.05, 0.95, 0.9
 _STEP_S = 0.01
@@ -89,7 +91,9 @@ def _demands(
     sample: FlatSample, state: FlatState, tilt: Array, vehicle: Vehicle
 ) -> tuple[_Demand, ...]:
     thrust_max = vehicle.thrust_max_mps2
-    rates, most = np.abs(body_rates(sample, state)), vehicle.angular_rate_limit_radps
+    rates, most = body_rates(sample, state), vehicle.angular_rate_limit_radps
+    tilting = np.abs(np.diff(rates[:, :2], axis=0, prepend=rates[:1, :2])).max(axis=1) / _STEP_S
+    rates = np.abs(rates)
     speed = np.linalg.norm(sample.velocity_ned_mps, axis=-1)
     height = 0.0 - sample.position_ned_m[:, 2]  # no -0
     distance = np.linalg.norm(sample.position_ned_m, axis=-1)
@@ -102,6 +106,7 @@ def _demands(
         _Demand("a roll rate of", "rad/s", rates[:, 0], most[0]),
         _Demand("a pitch rate of", "rad/s", rates[:, 1], most[1]),
         _Demand("a yaw rate of", "rad/s", rates[:, 2], most[2]),
+        _Demand("a roll or pitch acceleration of", "rad/s^2", tilting, TILTING_MAX_RADPS2),
         _Demand("a speed of", "m/s", speed, SPEED_MAX_MPS),
         _Demand("a height of", "m", height, HEIGHT_MIN_M, -1.0, of_path=True),
         _Demand("a distance of", "m", distance, DISTANCE_MAX_M, of_path=True),

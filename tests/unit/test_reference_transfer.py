@@ -129,14 +129,19 @@ def test_table_track_passes_through_every_row_with_its_heading() -> None:
 
 
 def test_knot_fit_smooths_rounded_rows() -> None:
-    """Rows at 100 Hz rounded to a millimetre cannot be flown interpolated, but fitted they can."""
-    times = np.arange(0, 10, 0.01)
-    rows = "".join(
-        f"{t:.2f},{2 * math.sin(0.7 * t):.3f},{math.cos(0.7 * t):.3f},3.000\n" for t in times
-    )
-    text = "time_s,x,y,altitude_m\n" + rows
-    with pytest.raises(ValueError, match=r"rate of|tilt of"):
-        check(table_track(text), PX4)
+    """Rows at 25 Hz rounded to 0.1 mm, and at 100 Hz rounded to a millimetre, cannot be flown
+    interpolated, but fitted they can."""
+    for step_s, digits, exceeded in (
+        (0.04, 4, "acceleration of"),
+        (0.01, 3, "rate of|tilt of|acceleration of"),
+    ):
+        rows = "".join(
+            f"{t:.2f},{2 * math.sin(0.7 * t):.{digits}f},{math.cos(0.7 * t):.{digits}f},3\n"
+            for t in np.arange(0, 10, step_s)
+        )
+        text = "time_s,x,y,altitude_m\n" + rows
+        with pytest.raises(ValueError, match=exceeded):
+            check(table_track(text), PX4)
     fitted = table_track(text, knot_spacing_s=0.5)
     check(fitted, PX4)
     s = np.linspace(2.0, 7.0, 100)
