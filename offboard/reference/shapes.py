@@ -46,6 +46,9 @@ Term = tuple[
     Annotated[float, Field(ge=-360, le=360)],
 ]
 
+# Largest change, in m and rad, by which dense rows of a table are smoothed, and knots of that fit
+ROUNDED, ROUNDED_KNOTS_S = 0.03, 0.5
+
 
 class Shape(Parameters, ABC):
     """Settings of every shape. Its origin is `height_m` above the take-off point, and
@@ -255,15 +258,17 @@ class FromTable(Shape):
     """A CSV table (see `table`). Positions and heights are relative to the take-off point.
 
     `course: table` uses the column course_deg, or the fixed `course_deg` if the table has no such
-    column. `knot_spacing_s` > 0 smooths rounded or noisy rows. `text` is the content of `file`,
-    filled in by the reader of the file, so that a recorded configuration is complete.
+    column. `knot_spacing_s` > 0 smooths noisy rows, 0 passes through every row. Without it, dense
+    rows are smoothed by at most ROUNDED, because their rounding would demand great accelerations.
+    `text` is the content of `file`, filled in by the reader of the file, so that a recorded
+    configuration is complete.
     """
 
     shape: Literal["table"] = "table"
     file: Annotated[str, Field(min_length=1, max_length=4096)]
     text: str | None = None
     height_m: Literal[0] = 0
-    knot_spacing_s: Annotated[float, Field(ge=0, le=60)] = 0.0
+    knot_spacing_s: Annotated[float | None, Field(ge=0, le=60)] = None
     course: Literal["table", "fixed", "along_velocity"] = "table"  # type: ignore[assignment]
     run_in_s: Seconds = 2.0
     run_out_s: Seconds = 2.0
@@ -281,7 +286,11 @@ class FromTable(Shape):
         values = rows.points_ned_m
         if self.course == "table" and rows.heading_rad is not None:
             values = np.column_stack((values, rows.heading_rad))
-        return interpolate(rows.times_s, values, self.knot_spacing_s)
+        if self.knot_spacing_s is not None:
+            return interpolate(rows.times_s, values, self.knot_spacing_s)
+        smooth = interpolate(rows.times_s, values, ROUNDED_KNOTS_S)
+        is_near = np.abs(smooth.jet(rows.times_s)[0] - values).max() <= ROUNDED
+        return smooth if is_near else interpolate(rows.times_s, values)
 
 
 SHAPES: Mapping[str, type[Shape]] = {
