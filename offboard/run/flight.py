@@ -38,6 +38,7 @@ from offboard.mavlink.senders import DIALECTS
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
 from offboard.model.command import Command, PositionCommand
+from offboard.model.vehicle import DelayUncertainty
 from offboard.reference.track import Track, hold
 from offboard.run.configuration import (
     FlightConfig,
@@ -246,6 +247,8 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
             least_s = _check_deadline(controller, cut_short, config.budget_s)
     prepared.track.sample(np.array([0.0, 1.0]))
     with outside("controller"):
+        if isinstance(controller, Adaptive):
+            controller.set_vehicle(config.vehicle, DelayUncertainty())
         controller.reset()
     return least_s
 

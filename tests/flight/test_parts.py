@@ -94,7 +94,7 @@ def test_rehearsal_finds_a_failing_law(fail: Any, says: str) -> None:
         rehearse(replace(prepared, controller=law), keeps_deadline=False)
 
 
-@pytest.mark.parametrize("part", ["build", "refusal", "reset"])
+@pytest.mark.parametrize("part", ["build", "refusal", "reset", "set_vehicle"])
 def test_rehearsal_finds_a_law_that_exits_the_program(
     part: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -102,11 +102,12 @@ def test_rehearsal_finds_a_law_that_exits_the_program(
         raise SystemExit(3)
 
     resolved = config.load("flight", known_vehicle="px4_sih")
-    law = build(resolved).controller if part == "reset" else resolved.controller
-    monkeypatch.setattr(type(law), part, exits)
+    built = build(resolved)
+    of_a_law = part in ("reset", "set_vehicle")
+    monkeypatch.setattr(type(built.controller if of_a_law else resolved.controller), part, exits)
     says = r"controller.*: SystemExit: 3 \(.*test_parts\.py:\d+\)"
     with pytest.raises(DocumentError, match=says):
-        rehearse(build(resolved), keeps_deadline=False)
+        rehearse(built if of_a_law else build(resolved), keeps_deadline=False)
 
 
 def test_rehearsal_finds_a_law_that_fails_at_its_deadline(
