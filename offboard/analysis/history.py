@@ -91,8 +91,8 @@ class History:
     one that our vehicle record names, or else the first autopilot in the log, or None; only its
     messages and ours are used. `dialect` is None also for an unknown autopilot. `substitutes` are
     the messages that took the place of missing ones, as in the log of a ground station. `damage`
-    says what could not be read; `damage_s` is the time of the newest telemetry before the first
-    damaged entry, or NaN.
+    says what was not read, damaged entries last; `damage_s` is the time of the newest telemetry
+    before the first of them, or NaN.
     """
 
     position: Rows
@@ -141,7 +141,7 @@ def gather(log: Tlog, *, unix_times: bool = False) -> History:
         if log.damaged and math.isnan(collector.damage_s):
             collector.damage_s = collector.now_s
         collector.add(entry)
-    return collector.history("; ".join(filter(None, (log.damage, others))))
+    return collector.history("; ".join(filter(None, (others, log.damage))))
 
 
 def configuration(log: Tlog) -> str | None:
@@ -350,7 +350,9 @@ def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None, str]:
             if flown and flown.system_id == entry.system_id:
                 found = Address(flown.system_id, flown.component_id)
                 return found, DIALECTS.get(flown.autopilot), ""
-    first, *others = heard or [None]
-    systems = ", ".join(str(each.system_id) for each in others if each)
+    if not heard:
+        return None, None, ""
+    first, *others = heard
+    systems = ", ".join(str(each.system_id) for each in others)
     said = f"{log.path}: of several vehicles the first is used, not system {systems}"
-    return first, heard.get(first) if first else None, said if others else ""
+    return first, heard[first], said if others else ""

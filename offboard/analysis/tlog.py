@@ -94,13 +94,13 @@ class Tlog:
     def damage(self) -> str:
         """One sentence that says what was not read; empty if everything was."""
         said = []
-        if self.damaged:
-            entries = f"{self.damaged} damaged entr{'ies were' if self.damaged > 1 else 'y was'}"
-            said.append(f"{entries} skipped, the first at byte {self.first_damage}")
         if self.second_flight:
             said.append(
                 f"only the first flight is read, another begins at byte {self.second_flight}"
             )
+        if self.damaged:
+            entries = f"{self.damaged} damaged entr{'ies were' if self.damaged > 1 else 'y was'}"
+            said.append(f"{entries} skipped, the first at byte {self.first_damage}")
         return f"{self.path}: {'; '.join(said)}" if said else ""
 
     def __iter__(self) -> Iterator[LoggedMessage]:

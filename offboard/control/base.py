@@ -87,7 +87,7 @@ class Decision:
         """Raise the error of a wrong type here, where the law makes its decision."""
         if not isinstance(self.command, Command | PositionCommand):
             raise TypeError(f"{shown(self.command)} is no Command and no PositionCommand")
-        [float(figure) for figure in astuple(self.certificate)]  # as the log will have them
+        [float(figure) for figure in astuple(self.certificate)]  # the log needs numbers
 
 
 class DecisionError(ArithmeticError):

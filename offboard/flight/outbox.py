@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import astuple
+from itertools import chain
 from numbers import Real
 from typing import Any
 
@@ -91,20 +91,21 @@ def admit(
 def usable(command: Command | PositionCommand) -> bool:
     """Whether all values are numbers that float32 can hold, and the thrust direction is a unit
     vector. Vectors must be tuples, because commands are compared with ==."""
-    # lengths of the fields; 0: a number
-    lengths = (3, 3, 3, 0, 0) if isinstance(command, PositionCommand) else (0, 3, 0)
-    numbers: list[Any] = []
-    for value, length in zip(astuple(command), lengths, strict=True):
-        if length and not (isinstance(value, tuple) and len(value) == length):
-            return False
-        numbers += value if length else [value]
+    if isinstance(command, PositionCommand):
+        vectors = [command.position_ned_m, command.velocity_ned_mps, command.acceleration_ned_mps2]
+        scalars = [command.heading_rad, command.heading_rate_radps]
+    else:
+        vectors = [command.thrust_direction_ned]
+        scalars = [command.thrust_mps2, command.heading_rad]
+    if not all(isinstance(each, tuple) and len(each) == 3 for each in vectors):
+        return False
+    numbers: list[Any] = [*scalars, *chain(*vectors)]
     if not all(isinstance(each, Real) for each in numbers):
         return False
     if not all(abs(each) <= FLOAT32_MAX for each in numbers):
         return False
-    if isinstance(command, PositionCommand):
-        return True
-    return abs(math.hypot(*command.thrust_direction_ned) - 1.0) <= _LENGTH_TOLERANCE
+    is_unit = abs(math.hypot(*vectors[0]) - 1.0) <= _LENGTH_TOLERANCE
+    return is_unit or isinstance(command, PositionCommand)
 
 
 def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool) -> Command:

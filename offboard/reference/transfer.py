@@ -25,7 +25,7 @@ _RAMPS_SHARE = 0.6  # greatest share of the distance for acceleration and brakin
 _SMOOTH_PEAK = 35.0 / 16.0  # greatest slope of the smoothstep of degree 7
 _BRAKE_MIN_S = 1.5
 _CREEP_MPS = 0.5  # up to this speed a start needs no braking
-_LOW_M = 0.5  # a way between heights that differ by less is straight
+_LEVEL_M = 0.5  # a way between heights that differ by less is straight
 _AHEAD = 0.7  # least cosine between the start's velocity and the direction of the target
 
 
@@ -101,10 +101,10 @@ def transfer(
 
 
 def _stops(begin: Array, end: Array) -> list[Array]:
-    """Return the ends of the ways at the greater of two heights: `end`, after a corner over the
-    lower one if the straight way is flat and low."""
+    """Return where the vehicle stops on a level way: at `end`, and before it at a corner vertically
+    above the lower of the two places, unless the straight way is steep or nearly level."""
     north_m, east_m, down_m = end[0, :3] - begin[0, :3]
-    if abs(down_m) < _LOW_M or math.hypot(north_m, east_m) <= abs(down_m):
+    if abs(down_m) < _LEVEL_M or math.hypot(north_m, east_m) <= abs(down_m):
         return [end]
     lower, higher = (begin, end) if down_m < 0.0 else (end, begin)
     corner = _at_rest(lower[0])

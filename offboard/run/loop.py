@@ -100,8 +100,8 @@ class Loop:
                 if self._flown.current.phase in WAITING:
                     self._error = ""  # the flight that the error ended is over
             except BaseException as error:  # a control law may even raise SystemExit
-                of_a_law = isinstance(error, Exception | SystemExit | KeyboardInterrupt)
-                if self._simulator and not of_a_law:
+                is_usual = isinstance(error, Exception | SystemExit | KeyboardInterrupt)
+                if self._simulator and not is_usual:
                     raise  # a test runner ends its test (pytest-timeout)
                 if not self._stops.repeated:  # a third signal interrupts a law that hangs
                     self._hand_back(error)

@@ -257,7 +257,8 @@ class Mission:
 
     def _tell(self) -> None:
         """Say which item begins."""
-        if title := self.firmware.item_titles.get(self.items[self.current].command):
+        titles = self.firmware.item_titles
+        if self._has_item and (title := titles.get(self.items[self.current].command)):
             self.texts.append(info(f"Mission: {self.current} {title}"))
 
     def _finish(self, event: str) -> None:

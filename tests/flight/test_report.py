@@ -257,16 +257,18 @@ def test_home_position_is_the_origin_only_without_global_origin(
     assert row["position_ned_m"] == pytest.approx([north_m, 0.0, 0.0], abs=0.01)
 
 
+OTHER = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(mavlink.MAVLink(None, 9, 1))
+
+
 def test_second_vehicle_in_a_foreign_log_is_named(tmp_path: Path, recorded: Flight) -> None:
-    other = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(mavlink.MAVLink(None, 9, 1))
     log = tmp_path / "two.tlog"
-    log.write_bytes(PX4.read_bytes() + STAMP + other)
+    log.write_bytes(PX4.read_bytes() + STAMP + OTHER)
     said = f"{log}: of several vehicles the first is used, not system 9"
     assert set(read(log).missing) == {*recorded.missing, said}
 
 
 def test_report_names_the_place_of_log_damage(tmp_path: Path, recorded: Flight) -> None:
-    data = bytearray(PX4.read_bytes())
+    data = bytearray(PX4.read_bytes() + STAMP + OTHER + STAMP + OTHER)
     at = len(data) // 2
     data[at : at + 500] = bytes(500)
     damaged = tmp_path / "damaged.tlog"

@@ -112,6 +112,17 @@ def test_px4_refuses_an_int_frame_in_the_message_with_degrees() -> None:
         assert acks(bench) == [result]
 
 
+@pytest.mark.parametrize(("firmware", "mode"), [(PX4, "AUTO.MISSION"), (ARDUPILOT, "AUTO")])
+def test_pilot_may_switch_to_a_mission_that_does_not_exist(firmware: Firmware, mode: str) -> None:
+    bench = Bench(firmware=firmware, boot_scale=0.1)
+    bench.run(6.0)
+    bench.command(176, 1, 4)  # GUIDED
+    assert bench.command(400, 1) == [0]
+    bench.instance.autopilot.commander.switch(mode)
+    bench.run(1.0)
+    assert bench.armed
+
+
 def test_px4_holds_when_its_mission_is_cleared() -> None:
     bench = aloft(height_m=5.0)
     assert upload(bench, ROUND) == 0
