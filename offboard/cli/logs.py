@@ -203,7 +203,8 @@ def identify(
     if recorded.history.damage:
         complain(recorded.history.damage)
     found, trace = identify_flight(recorded.history, prior)
-    text = vehicle_file(found, prior, recorded.name)
+    named = prior.model_copy(update={"name": output.stem[:40] if output else "identified"})
+    text = vehicle_file(found, named, recorded.name)
     shown = free_name((output or tlog.find(flight)).with_name("identify.html"))
     write_new(shown, page([recorded], fits(found, trace, prior)))
     if not found.supported:

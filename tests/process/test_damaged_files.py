@@ -89,6 +89,7 @@ def test_identify_reads_logs_with_euler_angles(called: Called, tmp_path: Path) -
     (tmp_path / "identify.html").write_text("precious")
     assert called("offboard identify -o mine.yaml .")[::2] == (0, "")
     found = yaml.safe_load((tmp_path / "mine.yaml").read_text())
+    assert found["name"] == "mine"
     assert found["hover_thrust"] == pytest.approx(0.365, abs=0.01)
     assert found["tilt"]["natural_frequency_radps"] == pytest.approx(10.2, abs=1.0)
     assert (tmp_path / "identify.html").read_text() == "precious"
