@@ -88,26 +88,37 @@ def figures(flights: Sequence[Flight]) -> dict[str, Figure]:
 
 
 def _path(flights: Sequence[Flight]) -> Figure | None:
-    first = flights[0].history
+    longest = max(flights, key=lambda flight: len(flight.history.reference))
     lines = [
         (one.label or "estimated", one.history.position, one.colour, "solid") for one in flights
     ]
-    lines.insert(1, ("reference", first.reference, INK, "dash"))
+    lines.insert(1, ("reference", longest.history.reference, INK, "dash"))
     if len(flights) == 1:
-        lines.insert(1, ("true (simulator)", first.truth, ORANGE, "solid"))
+        lines.insert(1, ("true (simulator)", longest.history.truth, ORANGE, "solid"))
     figure = go.Figure([_path_of(*line) for line in lines if len(line[1])])
     if not figure.data:
         return None
-    scene = {
-        "xaxis_title": "east, m", "yaxis_title": "north, m", "zaxis_title": "height, m",
-        "aspectmode": "data", "xaxis_nticks": 5, "yaxis_nticks": 5, "zaxis_nticks": 5,
+    places = np.concatenate([rows["position_ned_m"] for _, rows, *_ in lines])
+    places = places[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    low, high = np.nanmin(places, axis=0), np.nanmax(places, axis=0)
+    # One scale on all axes. None is shorter than half of the longest, so that a path along one axis
+    # fits into the figure
+    lengths = 1.04 * np.maximum(high - low, max(0.5 * (high - low).max(), 0.1))
+    ratio = 1.4 * lengths / lengths.max()
+    ends = (low + high) / 2.0 + np.outer([-0.5, 0.5], lengths)
+    scene: dict[str, Any] = {
+        f"{axis}axis": {"title": f"{title}, m", "nticks": 5, "range": both.tolist()}
+        for axis, title, both in zip("xyz", ("east", "north", "height"), ends.T, strict=True)
+    }
+    scene |= {
+        "aspectmode": "manual", "aspectratio": dict(zip("xyz", ratio.tolist(), strict=True)),
         "camera": {"eye": {"x": -1.5, "y": -1.8, "z": 1.0}, "center": {"x": 0, "y": 0, "z": -0.15}},
     }  # fmt: skip
     figure.update_layout(
         template=STYLE, height=520, scene=scene, margin={"l": 0, "r": 0, "t": 36, "b": 40},
         showlegend=True,
     )  # fmt: skip
-    caption = "" if len(flights) == 1 else f"The reference is that of flight {flights[0].label}."
+    caption = "" if len(flights) == 1 else f"The reference is that of flight {longest.label}."
     return Figure("Path", figure, caption)
 
 

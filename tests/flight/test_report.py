@@ -114,8 +114,13 @@ def test_linked_figures_zoom_together(opened: Opened) -> None:
 
 
 def test_3d_path_is_drawn_east_north_up(recorded: Flight) -> None:
-    """The axes of a scene are right-handed: east, north, up."""
-    (curve,) = figures([recorded])["path"].drawing.data
+    """The axes of a scene are right-handed: east, north, up. A path along one axis fits, too."""
+    drawing = figures([recorded])["path"].drawing
+    (curve,) = drawing.data
+    shares = [drawing.layout.scene.aspectratio[axis] for axis in "xyz"]
+    lengths = [np.ptp(drawing.layout.scene[f"{axis}axis"].range) for axis in "xyz"]
+    assert np.divide(shares, lengths) == pytest.approx(shares[0] / lengths[0])  # one scale
+    assert 0.5 * max(shares) <= min(shares) <= max(shares) < 1.5
     north, east, down = recorded.history.position["position_ned_m"][[0, -1]].T
     ends = [[axis[0], axis[-1]] for axis in (curve.x, curve.y, curve.z)]
     assert np.array(ends) == pytest.approx(np.array([east, north, -down]))
