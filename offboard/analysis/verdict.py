@@ -111,7 +111,7 @@ def verdict_metrics(flown: History, skipped_s: float) -> dict[str, Any]:
 
 def _ended_early(flown: History) -> tuple[str, str]:
     """Return what ended the flight early, and the sentence that announced it. Without an early end,
-    return REFERENCE_OVER, or the last phase if the reference was never tracked."""
+    return REFERENCE_OVER, or that the log lacks the end of the reference."""
     names = [event.phase for event in flown.phases]
     for event in irregular(flown.phases):
         taken = event.cause == "mode change" and _critical(flown)
@@ -121,7 +121,7 @@ def _ended_early(flown: History) -> tuple[str, str]:
         return SUPERVISOR, took_over[0]
     if names[-1] not in _LANDING_ENDS:
         return f"the log ends in the phase {names[-1]}", ""
-    return REFERENCE_OVER if "track" in names else names[-1], ""
+    return REFERENCE_OVER if "hover" in names else "the log lacks a part of the flight", ""
 
 
 def irregular(phases: tuple[Event, ...]) -> list[Event]:
@@ -133,7 +133,7 @@ def irregular(phases: tuple[Event, ...]) -> list[Event]:
         for before, event in pairwise(phases)
         if event.phase in {"hold", "land", "stand down", *_LANDING_ENDS}
         and (before.phase, event.phase) != ("land", "disarmed")
-        and (before.phase, event.phase, event.reason) != ("hover", "land", RESTS)
+        and (event.phase, event.reason) != ("land", RESTS)
     ]
 
 
