@@ -49,7 +49,10 @@ def ask(study: optuna.Study, ranges: Mapping[str, Ends]) -> tuple[optuna.Trial, 
     """Return the trial and the values to try next, within `ranges` (key -> lowest, highest). The
     caller tells the study the cost of the trial."""
     trial = study.ask()
-    asked = {key: trial.suggest_float(key, *ends) for key, ends in ranges.items()}
+    asked = {
+        key: trial.suggest_float(key, *ends, step=1.0 if key == SEED else None)
+        for key, ends in ranges.items()
+    }
     return trial, plain(asked, DIGITS)
 
 
@@ -104,7 +107,8 @@ class FailureSearch:
             return fly_cases(cases)
 
         failures: dict[tuple[str, tuple[str, ...]], Failure] = {}
-        for failure in self._reduced(self._worst(self._flown(fly), CANDIDATES * count), fly):
+        reduced = self._reduced(self._worst(self._flown(fly), CANDIDATES * count), fly)
+        for failure in sorted(reduced, key=lambda each: each.record.margin):
             failures.setdefault(failure.kind, failure)
         found = self._at_seeds(list(failures.values())[:count], fly)
         campaign.cases = list(flown.values())
@@ -201,7 +205,7 @@ class FailureSearch:
         }
         if SEED in ranges:
             middle[SEED] = float(self._base.seed)
-        return middle | self._search.defaults
+        return plain(middle | self._search.defaults, DIGITS)
 
     def _case(self, values: Point) -> Case:
         seed = round(values.get(SEED, self._base.seed))

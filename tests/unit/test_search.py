@@ -18,7 +18,7 @@ from offboard.campaign.document import CampaignFile, Promises
 from offboard.campaign.flight import Job
 from offboard.campaign.results import Record, Results
 from offboard.campaign.run import Campaign, Fly, Incomplete, Progress, flying
-from offboard.campaign.search import Failure, FailureSearch, as_csv
+from offboard.campaign.search import Failure, FailureSearch, as_csv, ask, study_of
 from offboard.campaign.tune import Tuned, TuneFile, Tuning, judge, profile
 from offboard.documents.errors import DocumentError, UserError
 from offboard.documents.reading import load_document
@@ -98,6 +98,7 @@ def test_search_reduces_failures_to_their_causes(
     hot, rough = found["error", (NORTH, BANDWIDTH)], found["tilt", (EAST, GUSTS)]
     assert (hot.failing, hot.seeds) == (2, 4)  # seeds 2 .. 5, of which 4 and 5 do not fail
     assert (rough.failing, rough.seeds) == (4, 4)
+    assert failures == sorted(failures, key=lambda failure: failure.record.margin)
     assert "wind_ned_mps:\n  - 0.0\n" in rough.case.scenario_text  # north is back at its default
     assert "--set controller.bandwidth_radps=7." in as_csv(failures)
     shown = (campaign.directory / "campaign.html").read_text()
@@ -128,6 +129,13 @@ def test_interrupted_search_resumes_with_the_same_result(
     assert as_csv(again) == as_csv(failures)
     tables = [(each.directory / "campaign.csv").read_bytes() for each in (parts, whole)]
     assert tables[0] == tables[1]
+
+
+def test_searched_seeds_are_whole_numbers() -> None:
+    study = study_of(1)
+    asked = [ask(study, {"seed": (3, 50), BANDWIDTH: (2, 8)})[1] for _ in range(20)]
+    assert all(values["seed"] in range(3, 51) for values in asked)
+    assert len({values[BANDWIDTH] for values in asked}) == 20
 
 
 def test_search_without_optuna_flies_nothing(
