@@ -2,10 +2,6 @@
 
 Installed with the package. It imports the rest of the package when a test uses `fly`, so that other
 test suites are not slowed down.
-
-    def test_tracks(fly):
-        flight = fly(reference="lemniscate", controller="pso", scenario="gusts", seed=3)
-        assert flight.score.rmse_position_m < 0.15
 """
 
 from __future__ import annotations

@@ -2,14 +2,6 @@
 
 Installed with the package. It imports the rest of the package when a test uses `sitl`, so that
 other test suites are not slowed down.
-
-    import pytest
-    from pymavlink import mavutil
-
-    @pytest.mark.sitl(scenario="wind_2mps", firmware="px4", seed=7, speed=5.0)
-    def test_mine(sitl):
-        vehicle = mavutil.mavlink_connection(sitl.connection)
-        assert vehicle.wait_heartbeat(timeout=20)
 """
 
 from __future__ import annotations

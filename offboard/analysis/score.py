@@ -57,10 +57,6 @@ class Score:
     `missed_ticks`; `refused_setpoints` are among `decisions`. The distance to keep-out volumes is
     no metric; it is the margin `clearance` of a campaign. Times are vehicle time. A metric for
     which the log has no data is NaN.
-
-    Example, with the pytest fixture `fly`:
-
-        assert fly(reference="hover").score.rmse_position_m < 0.05
     """
 
     completed: float = _metric("1: all tracked, landed, disarmed")
@@ -216,10 +212,7 @@ _PATTERN = re.compile(rf"\s*(\w+)\s*(<=|>=|==|<|>)\s*({_NUMBER})\s*")
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """One metric of the score compared with a number.
-
-    Example: `Requirement.parse("rmse_position_m<0.05").met(score.metrics())`.
-    """
+    """One metric of the score compared with a number."""
 
     metric: str
     comparison: str

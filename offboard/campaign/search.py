@@ -205,7 +205,8 @@ class FailureSearch:
         }
         if SEED in ranges:
             middle[SEED] = float(self._base.seed)
-        return plain(middle | self._search.defaults, DIGITS)
+        found: dict[str, float] = plain(middle | self._search.defaults, DIGITS)
+        return found
 
     def _case(self, values: Point) -> Case:
         seed = round(values.get(SEED, self._base.seed))

@@ -7,6 +7,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -98,7 +99,6 @@ def test_search_reduces_failures_to_their_causes(
     hot, rough = found["error", (NORTH, BANDWIDTH)], found["tilt", (EAST, GUSTS)]
     assert (hot.failing, hot.seeds) == (2, 4)  # seeds 2 .. 5, of which 4 and 5 do not fail
     assert (rough.failing, rough.seeds) == (4, 4)
-    assert failures == sorted(failures, key=lambda failure: failure.record.margin)
     assert "wind_ned_mps:\n  - 0.0\n" in rough.case.scenario_text  # north is back at its default
     assert "--set controller.bandwidth_radps=7." in as_csv(failures)
     shown = (campaign.directory / "campaign.html").read_text()
@@ -129,6 +129,18 @@ def test_interrupted_search_resumes_with_the_same_result(
     assert as_csv(again) == as_csv(failures)
     tables = [(each.directory / "campaign.csv").read_bytes() for each in (parts, whole)]
     assert tables[0] == tables[1]
+
+
+def test_worst_failure_comes_first_after_its_reduction(tmp_path: Path) -> None:
+    """Gusts only make failures of the first kind worse: reduced, the others are the worst."""
+
+    def in_gusts(case: Case) -> Record:
+        record, at = two_regions(case), dict(case.values)
+        deeper = 5.0 * at[GUSTS] if record.weakest == "error" else 0.6
+        return replace(record, margin=record.margin - deeper * (record.margin < 0.0))
+
+    failures = searched(tmp_path, record=in_gusts)[1]
+    assert [failure.record.weakest for failure in failures] == ["tilt", "error"]
 
 
 def test_searched_seeds_are_whole_numbers() -> None:
