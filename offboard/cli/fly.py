@@ -115,7 +115,7 @@ def fly(
 
 
 def _exit_at_once() -> None:
-    """Exit at once, even while functions are compiled. The simulator ends as its pipe closes."""
+    """Exit, even while functions are compiled. The simulator ends as its pipe closes."""
     os.write(2, f"{INTERRUPTED}\n".encode())
     os._exit(INTERRUPT)
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import ExitStack
-from copy import deepcopy
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -29,6 +28,7 @@ from offboard.flight.record import configuration_pieces
 from offboard.identification.learner import Learner
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link import clock
+from offboard.link.background import within
 from offboard.link.connection import open_link, open_lockstep_link
 from offboard.link.interface import Link
 from offboard.link.log import FlightLog
@@ -57,6 +57,7 @@ from offboard.run.sitl import (
 from offboard.supervisor.supervisor import Supervisor
 
 REHEARSED_DECISIONS = 5  # the fastest is compared with the deadline: the computer may be busy
+REHEARSAL_S = 60.0  # a law may compile its own code when it is first called
 DISCARDED_MAX = 20  # calls of `Link.receive` that `discard` makes at most
 SITL_TIMEOUT_S = 180.0  # either side of lockstep waits this long for the other, which may compile
 
@@ -219,9 +220,19 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
     pause of seconds at the first decision in flight would crash the vehicle.
 
     Returns the wall time of the shortest possible decision in seconds, NaN without
-    `keeps_deadline`. Raises DocumentError if the control law fails or, with `keeps_deadline`, if
-    a decision cannot meet the deadline.
+    `keeps_deadline`. Raises DocumentError if the control law fails, does not return within
+    REHEARSAL_S or, with `keeps_deadline`, if a decision cannot meet the deadline.
     """
+    law = prepared.config.controller.law
+    try:
+        return within(REHEARSAL_S, lambda: _rehearsed(prepared, keeps_deadline=keeps_deadline))
+    except TimeoutError:
+        raise DocumentError(
+            f"controller: the law {law} has not returned in {REHEARSAL_S:g} s"
+        ) from None
+
+
+def _rehearsed(prepared: Prepared, *, keeps_deadline: bool) -> float:
     config, controller = prepared.config, prepared.controller
     observer = Observer(config.vehicle)
     reference = hold((0.0, 0.0, -2.0), 0.1)
@@ -254,9 +265,8 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
 
 
 def _decided(controller: Controller, situation: Situation) -> Command | PositionCommand:
-    """Let the controller decide and return its command. Raises DocumentError if it raises, returns
-    a command that cannot be sent, or changes the given state."""
-    given = deepcopy(situation.state)
+    """Let the controller decide and return its command. Raises DocumentError if it raises, or
+    returns a command that cannot be sent."""
     with outside("controller"):
         command = decision_of(controller, situation).command
     if not usable(command):
@@ -264,9 +274,6 @@ def _decided(controller: Controller, situation: Situation) -> Command | Position
             f"controller: it decides {command}, which cannot be sent: all values must be finite "
             "numbers, vectors tuples of three, and the thrust direction of length 1"
         )
-    # the flight compares the given state with the motion that follows
-    if not all(map(np.array_equal, astuple(situation.state), astuple(given))):
-        raise DocumentError("controller: it changes the state that it is given; let it use a copy")
     return command
 
 
@@ -340,6 +347,7 @@ def fly(
         if supervisor:
             supervisor.await_ready()
         stops.check()
+        stops.in_flight = True  # from now on there is a log, which must not end without an outcome
         stack.enter_context(log)
         session = Session(vehicle.settings(link), signing)
         for piece in configuration_pieces(prepared.text):
