@@ -1,7 +1,8 @@
 """Checks of the link, the vehicle and the planned flight, in addition to the preflight list.
 
 A check is a function of an `Observation`; it returns nothing if there is nothing to report. Those
-in OF_VEHICLE run only if a vehicle was found. The docstring of a check is its line in `--list`.
+in OF_VEHICLE run only if a vehicle of a fit type was found. The docstring of a check is its line in
+`--list`.
 """
 
 from __future__ import annotations

@@ -131,13 +131,13 @@ def _listen(seen: Observation, link: Link, tell: Callable[[str], None]) -> None:
 
 def examine(asked: Mapping[str, Check], seen: Observation) -> Rows:
     """Run the checks. Returns a row for each check that has findings, those of the preflight list
-    included."""
-    found = seen.found is not None
-    blocking = list(preflight.findings(seen)) if found else []
+    included. Without a vehicle of a fit type those of a vehicle are left out."""
+    blocking = list(preflight.findings(seen)) if seen.found else []
+    fit = seen.found is not None and not preflight.unfit_type(seen)
     rows: Rows = {}
     for name, check in asked.items():
         findings = [each for about, _, each in blocking if about == name]
-        if found or check not in OF_VEHICLE:
+        if fit or check not in OF_VEHICLE:
             findings += _judged(check, seen, seen.began_s + LOOK_S - clock.monotonic_s())
         if findings:
             rows[name] = sorted(findings, key=lambda each: -each.level)

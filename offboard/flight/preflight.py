@@ -139,15 +139,18 @@ class Row:
 def findings(ground: Ground) -> Iterator[tuple[str, bool, Finding]]:
     """Yield what is wrong, in the order of the list, and then what is wrong with the autopilot's
     parameters. Each item has the name of the check, whether `fly` refuses the vehicle at once, and
-    the finding."""
+    the finding. The other rows, and the parameters, mean something else for a vehicle of an unfit
+    type."""
+    if unfit := unfit_type(ground):
+        yield "vehicle", True, Finding(Level.BLOCKS, unfit, _UNFIT)
+        return
     for row in PREFLIGHT:
         found = "" if row.fly_only and ground.service else row.problem(ground)
         if found:
             level = row.level if isinstance(row.level, Level) else row.level(ground)
             fix = row.fix if isinstance(row.fix, str) else row.fix(ground)
             yield row.check, row.at_once, Finding(level, found, fix)
-    dialect = None if unfit_type(ground) else ground.dialect  # a rover's GUID_OPTIONS are others
-    for parameter in dialect.watched_parameters if dialect else ():
+    for parameter in ground.dialect.watched_parameters if ground.dialect else ():
         name, value = parameter.name, ground.vehicle.parameters.get(parameter.name)
         fault = None if value is None else parameter.fault(value)
         if fault:
@@ -418,7 +421,6 @@ def _slow_hint(ground: Ground) -> str:
 
 WARN, WAIT, BLOCKS = Level.WARN, Level.WAIT, Level.BLOCKS
 PREFLIGHT = (
-    Row("vehicle", BLOCKS, unfit_type, _UNFIT, at_once=True),
     Row("state", BLOCKS, _flown_by_another, "stop that controller", at_once=True, fly_only=True),
     Row("state", BLOCKS, _flown_by_failsafe, _FAILSAFE, at_once=True, fly_only=True),
     Row("state", BLOCKS, armed_already, "disarm it", at_once=True, fly_only=True),

@@ -54,7 +54,8 @@ def check(reference: Reference, vehicle: Vehicle, slower: str = "") -> Envelope:
     """
     count = int(np.ceil(reference.duration_s / _STEP_S)) + 1
     times = np.linspace(0.0, reference.duration_s, count)
-    parts = [times[first : first + _CHUNK] for first in range(0, count, _CHUNK)]
+    # a part ends with the first sample of the next one, so that no step between two is left out
+    parts = [times[first : first + _CHUNK + 1] for first in range(0, count, _CHUNK)]
     reached = np.max([_envelope(reference, vehicle, slower, part) for part in parts], axis=0)
     return Envelope(*reached.tolist())
 
