@@ -212,7 +212,7 @@ class Commander:
 
     def _disarm(self) -> None:
         self.armed, self._delayed = False, None
-        if self._firmware.home_item_first:
+        if self._firmware.ardupilot_commands:
             self._guidance.mission.reset()
         self._controller.enter(self.mode.behaviour)  # begins again when the vehicle is armed again
 

@@ -115,10 +115,14 @@ class Firmware(ABC):
     set_mode_acked_as: int | None = None  # MAV_CMD in the answer to SET_MODE; None: no answer
     force_codes: Mapping[str, float]  # param2 of MAV_CMD_COMPONENT_ARM_DISARM that forces it
     reposition_mode: str  # mode that MAV_CMD_DO_REPOSITION enters
-    # True: MAV_CMD_DO_REPOSITION needs a frame and a place, and its yaw and speed are ignored; the
-    # height of MAV_CMD_NAV_TAKEOFF is above home; MAV_CMD_MISSION_START must not name an item.
-    # False: the height of MAV_CMD_NAV_TAKEOFF is above mean sea level
-    strict_places: bool = False
+    # True: commands and missions as in ArduPilot. MAV_CMD_DO_REPOSITION needs a frame and a place,
+    # and its yaw and speed are ignored; the height of MAV_CMD_NAV_TAKEOFF is above home;
+    # MAV_CMD_MISSION_START must not name an item. Item 0 of a mission is home, a takeoff item does
+    # not make the vehicle descend, disarming resets the mission, and a MISSION_ITEM with current =
+    # 2 is a place to fly to at once.
+    # False: as in PX4. The height of MAV_CMD_NAV_TAKEOFF is above mean sea level; a landing item
+    # counts as reached already above its place
+    ardupilot_commands: bool = False
     # result of MAV_CMD_DO_CHANGE_SPEED without a speed, and of MAV_CMD_GET_MESSAGE_INTERVAL of an
     # unknown message
     empty_refusal: Result
@@ -140,13 +144,9 @@ class Firmware(ABC):
     requests_kind_of_peer: bool = False  # requests items with or without _INT, as the peer last did
     # MAV_FRAME of a downloaded item, by its message and the MAV_FRAME of the upload
     item_frames: Mapping[str, Mapping[int, int]]
-    # item 0 of a mission is home, a takeoff item does not make the vehicle descend, disarming
-    # resets the mission, and a MISSION_ITEM with current = 2 is a place to fly to at once
-    home_item_first: bool = False
     mission_text: StatusText | None = None  # text after an upload
     # MAV_CMD -> name in the texts about the progress of a mission; without names there are none
     item_titles: Mapping[int, str] = field(default_factory=dict)
-    reached_above_landing: bool = False  # "item reached" also when above the place of a landing
     turning_items: frozenset[int] = frozenset()  # MAV_CMDs of items whose param4 is a yaw
 
     # telemetry

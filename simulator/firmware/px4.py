@@ -250,7 +250,6 @@ PX4 = Px4(
     setpoints_outlive_modes=True,
     requests_kind_of_peer=True,
     item_frames={"MISSION_ITEM": {5: 0, 6: 3}, "MISSION_ITEM_INT": {0: 5, 3: 6}},
-    reached_above_landing=True,
     turning_items=frozenset({16, 17, 19, 21}),
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,

@@ -222,7 +222,7 @@ class MissionTransfer:
         peer, kind = sender_of(message), message.mission_type
         items = self.mission.stored.get(kind, ())
         self._whole = whole = message.get_type() == "MISSION_REQUEST_INT"
-        is_home = self._firmware.home_item_first and message.seq == kind == 0
+        is_home = self._firmware.ardupilot_commands and message.seq == kind == 0
         if not (is_home or message.seq < len(items)):
             self._acknowledge(peer, Ack.ERROR, kind)
             return
