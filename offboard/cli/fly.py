@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -69,13 +69,8 @@ def fly(
     """
     try:
         from offboard.link.stop import StopRequests
-        from offboard.run.sitl import SimulatorProcess
 
-        with (
-            StopRequests(_exit_at_once) as stops,
-            SimulatorProcess() if options.sitl else nullcontext() as simulator,
-            ExitStack() as stack,
-        ):
+        with StopRequests(_exit_at_once) as stops, ExitStack() as stack:
             from offboard.analysis.score import Requirement
             from offboard.link import clock
             from offboard.live.lines import JsonLines, Terminal
@@ -94,7 +89,6 @@ def fly(
                 flight,
                 directory,
                 flown,
-                simulator=simulator,
                 stops=stops,
                 progress=displays.show,
                 tell=displays.tell,

@@ -316,8 +316,7 @@ def fly(
     """Fly `config` once with `vehicle` and log the flight in `directory`.
 
     `progress` is called often during the flight; `tell` is called with sentences about the
-    preparation. `simulator` and `stops` may be shared by several flights; without them this flight
-    makes its own.
+    preparation. `simulator` (by default a process) and `stops` may be shared by several flights.
 
     Example: `fly(load("flight"), Path("flights/1"), Simulated()).exit_code` is 0 if the vehicle has
     flown the reference and landed.
@@ -334,7 +333,7 @@ def fly(
         log.check()
         signing = vehicle.signing(stack)
         if isinstance(vehicle, Simulated):
-            simulator = simulator or stack.enter_context(SimulatorProcess())
+            simulator = simulator or SimulatorProcess()
             link = vehicle.open_link(simulator, config.seed)
             stack.callback(simulator.recall)
         else:
