@@ -123,7 +123,8 @@ class Ground:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One condition: `problem` returns what is wrong, empty if nothing is; `fix` says what to do.
+    """One condition: `problem` returns what is wrong, empty if nothing is; `fix` says what to do, a
+    text with values of the ground in braces.
 
     `at_once`: whether `fly` refuses without waiting `limits.health_s` for the problem to clear.
     `fly_only`: whether `daemon`, which waits for its pilot, leaves the condition out."""
@@ -148,7 +149,8 @@ def findings(ground: Ground) -> Iterator[tuple[str, bool, Finding]]:
         found = "" if row.fly_only and ground.service else row.problem(ground)
         if found:
             level = row.level if isinstance(row.level, Level) else row.level(ground)
-            fix = row.fix if isinstance(row.fix, str) else row.fix(ground)
+            fix = row.fix
+            fix = fix.format(ground=ground) if isinstance(fix, str) else fix(ground)
             yield row.check, row.at_once, Finding(level, found, fix)
     for parameter in ground.dialect.watched_parameters if ground.dialect else ():
         name, value = parameter.name, ground.vehicle.parameters.get(parameter.name)
@@ -322,11 +324,6 @@ def _needs_setpoints(ground: Ground) -> str:
     return f"its pre-arm checks pass in {vehicle.mode} only while setpoints arrive"
 
 
-def _other_mode(ground: Ground) -> str:
-    mode = ground.dialect.hold_mode if ground.dialect else ""
-    return f"select {mode}, as `offboard fly` does first"
-
-
 def _remedy(ground: Ground) -> str:
     return ground.dialect.remedy(ground.vehicle.texts) if ground.dialect else ""
 
@@ -410,13 +407,10 @@ _UNFIT = (
     "with its own autopilot"
 )
 _FAILSAFE = "let the pilot take over first"
+_OTHER_MODE = "select {ground.dialect.hold_mode}, as `offboard fly` does first"
 _CHOOSE = "choose one with --system, or give each vehicle its own port"
 _SAME_ID = "switch one off, or change its system id"
 _ONE_WAY = f"{_SAME_ID}; send the telemetry of one vehicle over one link only"
-
-
-def _slow_hint(ground: Ground) -> str:
-    return ground.dialect.slow_hint if ground.dialect else ""
 
 
 WARN, WAIT, BLOCKS = Level.WARN, Level.WAIT, Level.BLOCKS
@@ -430,13 +424,13 @@ PREFLIGHT = (
     Row("senders", BLOCKS, twin, _ONE_WAY),
     Row("rates", WAIT, _no_telemetry, _remedy),
     Row("supervisor", WAIT, _unguarded),
-    Row("rates", BLOCKS, _slow, _slow_hint),
+    Row("rates", BLOCKS, _slow, "{ground.dialect.slow_hint}"),
     Row("state", BLOCKS, _landed_unknown),
     Row("parameters", WAIT, _reading),
     Row("origin", WAIT, _origin),
     Row("estimator", _estimate_level, _no_estimate, _ESTIMATOR),
     Row("prearm", WAIT, _prearm, _prearm_fix, fly_only=True),
-    Row("prearm", WARN, _needs_setpoints, _other_mode, fly_only=True),
+    Row("prearm", WARN, _needs_setpoints, _OTHER_MODE, fly_only=True),
     Row("battery", BLOCKS, _empty_battery, "charge the battery"),
     Row("volume", BLOCKS, _outside_volume, "fly nearer to that point, or raise the limits"),
     Row("delay", WAIT, _measuring),

@@ -133,6 +133,7 @@ class FlightState(Ground):
     missed_decisions: int = 0  # in a row that were not sent
     failure: str = ""  # what prevented the newest of them
     failure_cause: str = ""  # in a word: controller, link or computer
+    # attitude setpoints, and their thrusts, since the newest position setpoint
     commands: deque[Command] = field(default_factory=lambda: deque(maxlen=COMMANDS_KEPT))
     thrusts: deque[float] = field(default_factory=lambda: deque(maxlen=THRUSTS_KEPT))
     announced: list[str] = field(default_factory=list)  # newest sentences, oldest first
