@@ -20,7 +20,7 @@ from pydantic import BaseModel, ValidationError
 from yaml.representer import SafeRepresenter
 
 from offboard.documents.errors import DocumentError, abridged, counted, meant, shown
-from offboard.documents.shipped import KINDS, beside, folder, locate, read_text
+from offboard.documents.shipped import KINDS, NAMING, beside, folder, locate, read_text
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -60,8 +60,9 @@ def load_document(name: str, kind: str, model: type[M]) -> tuple[M, str]:
     """Load and validate a file, given by shipped name or path; paths in it are relative to it.
     Returns the value, and the path for error messages. Raises DocumentError."""
     path = locate(name, kind)
-    raw = beside(read(read_text(path), str(path), kind), path)
-    return validate(raw, model, str(path)), str(path)
+    raw = read(read_text(path), str(path), kind)
+    named = beside(raw, path) if kind in NAMING else raw
+    return validate(named, model, str(path)), str(path)
 
 
 def parse(text: str, model: type[M], source: str, kind: str = "") -> M:

@@ -31,6 +31,8 @@ KINDS = {
     "configuration": ("", set(PARTS)),
 }  # fmt: skip
 
+NAMING = ("campaign", "tuning")  # the kinds whose texts are names of files
+
 
 def directory() -> Path:
     """The folder of the shipped configuration."""

@@ -59,7 +59,7 @@ from offboard.supervisor.supervisor import Supervisor
 REHEARSED_DECISIONS = 5  # the fastest is compared with the deadline: the computer may be busy
 REHEARSAL_S = 60.0  # a law may compile its own code when it is first called
 DISCARDED_MAX = 20  # calls of `Link.receive` that `discard` makes at most
-SITL_TIMEOUT_S = 180.0  # either side of lockstep waits this long for the other, which may compile
+SITL_TIMEOUT_S = 180.0  # in lockstep it waits this long for the simulator, which may compile
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +143,6 @@ class Simulated:
         """Options of the `simulator` command for a vehicle that sends to the local UDP `port`."""
         return [
             *("--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", "--lockstep"),
-            *("--patience", f"{SITL_TIMEOUT_S:g}"),
             *("--seed", str(seed), "--firmware", self.firmware),
             *(("--scenario", absolute(self.scenario)) if self.scenario else ()),
             *(("--vehicle", absolute(self.vehicle)) if self.vehicle else ()),
