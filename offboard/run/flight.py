@@ -59,7 +59,6 @@ from offboard.supervisor.supervisor import Supervisor
 REHEARSED_DECISIONS = 5  # the fastest is compared with the deadline: the computer may be busy
 REHEARSAL_S = 60.0  # a law may compile its own code when it is first called
 DISCARDED_MAX = 20  # calls of `Link.receive` that `discard` makes at most
-SITL_TIMEOUT_S = 180.0  # in lockstep it waits this long for the simulator, which may compile
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,7 +356,6 @@ def fly(
             stops=stops,
             progress=progress,
             simulator=simulator if simulated else None,
-            patience_s=SITL_TIMEOUT_S,
             supervisor=supervisor,
         )
         if supervisor:

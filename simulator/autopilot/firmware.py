@@ -134,11 +134,11 @@ class Firmware(ABC):
 
     # setpoints
     global_frames: frozenset[int]  # MAV_FRAMEs accepted in SET_POSITION_TARGET_GLOBAL_INT
-    setpoint_mode_needs_stream: bool = False  # without a stream, its pre-arm checks fail
-    setpoints_as_automatic: bool = False  # speed and turn rate limits are those of automatic flight
-    setpoints_outlive_modes: bool = False  # taken in any mode, and kept when the mode changes
-    # with attitude setpoints any thrust counts as flight, and no landing is detected
-    setpoints_imply_flight: bool = False
+    # True: setpoints as in ArduPilot. Speed and turn rate limits are those of automatic flight;
+    # with attitude setpoints any thrust counts as flight, and no landing is detected.
+    # False: as in PX4. They are taken in any mode, and kept when the mode changes; without a stream
+    # the pre-arm checks of their mode fail
+    ardupilot_setpoints: bool = False
 
     # missions
     requests_kind_of_peer: bool = False  # requests items with or without _INT, as the peer last did
@@ -177,9 +177,9 @@ class Firmware(ABC):
     never_to_all: frozenset[str] = frozenset()
     text_suffix: str = ""  # appended to each STATUSTEXT
     text_to_ground_stations_only: bool = False  # STATUSTEXTs wait for a ground station
-    parameters_bytewise: bool = False  # PARAM_VALUE holds the bytes of an integer, not its value
-    parameters_hashed: bool = False  # a list begins with _HASH_CHECK
-    parameters_numbered: bool = False  # PARAM_VALUE.param_index is set also outside a list
+    # parameters as in PX4: PARAM_VALUE has the bytes of an integer, not its value; a list begins
+    # with _HASH_CHECK; param_index is set also outside a list
+    px4_parameters: bool = False
     accepted_unsigned: frozenset[int]  # ids of messages that need no signature
     stamps_follow_clock: bool = False  # of signatures; False: they only count
 

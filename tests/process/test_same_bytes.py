@@ -20,7 +20,7 @@ from offboard.flight.phases import Outcome, Phase
 from offboard.flight.record import RECORD_ID, TickRecord
 from offboard.link.stop import StopRequests
 from offboard.mavlink.session import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.run import flight, sitl
+from offboard.run import loop, sitl
 from offboard.run.configuration import load
 from offboard.run.flight import Simulated, fly
 from offboard.run.sitl import InMemorySimulator, SimulatorProcess
@@ -119,7 +119,7 @@ def test_failing_or_hanging_simulator_ends_the_flight(
         return lambda **options: SimpleNamespace(exchange=exchange)
 
     monkeypatch.setattr(sitl, "registered", lambda: SimpleNamespace(load=load))
-    monkeypatch.setattr(flight, "SITL_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(loop, "SIMULATOR_S", 0.1)
     outcome = flown(tmp_path / "flight", Simulated(scenario="calm"), InMemorySimulator())
     assert outcome.exit_code == 3
     assert outcome.sentence.startswith(says)
