@@ -173,8 +173,7 @@ def failsafe_hold(flight: FlightState) -> bool:
 
 def hold_refused(flight: FlightState) -> str:
     """The autopilot cannot hold: PX4 without a global position, as by motion capture, does not."""
-    assert flight.dialect is not None
-    hold = flight.dialect.set_mode(flight.holds_in)
+    hold = flight.known_dialect.set_mode(flight.holds_in)
     result = flight.vehicle.results.get(hold.command, "ACCEPTED")
     if hold not in flight.requested_s or result in GOOD_RESULTS:
         return ""
@@ -186,8 +185,8 @@ def refused_to_pilot(flight: FlightState) -> str:
     mode in which he did."""
     refused, before = hold_refused(flight), flight.authority.engaged_from
     flown = flight.outcome is None or flight.outcome.exit_code != REFUSED
-    assert flight.dialect is not None
-    if not refused or flown or before not in flight.dialect.assisted_modes or flight.returns_to:
+    assisted = flight.known_dialect.assisted_modes
+    if not refused or flown or before not in assisted or flight.returns_to:
         return ""
     return f"{refused}: back to {before}"
 

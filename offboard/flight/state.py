@@ -195,8 +195,7 @@ class FlightState(Ground):
     @property
     def holds_in(self) -> str:
         """The mode in which the vehicle is held or handed back."""
-        assert self.dialect is not None
-        return self.returns_to or self.dialect.hold_mode
+        return self.returns_to or self.known_dialect.hold_mode
 
     @property
     def in_the_air(self) -> bool:

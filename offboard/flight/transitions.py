@@ -182,10 +182,8 @@ def _begin_to_fly(flight: FlightState, source: Phase) -> None:
     """Note what is known about vehicle and link when the first phase in flight begins."""
     flight.authority.ask()  # it may show the mode already
     flight.clock.settle()
-    dialect = flight.dialect
-    assert dialect is not None
     rates_hz = flight.session.telemetry.rates_hz
-    flight.positioning.begin(flight.vehicle, rates_hz, dialect.estimator_message)
+    flight.positioning.begin(flight.vehicle, rates_hz, flight.known_dialect.estimator_message)
     if flight.identification:
         flight.identification.on_link_delay(flight.clock.delay)
         if limits := shown_limits(flight, flight.identification):

@@ -29,7 +29,7 @@ from offboard.flight.preflight import Finding, Ground, Level, findings
 from offboard.flight.vehicle_state import VehicleState
 from offboard.link import clock
 from offboard.link.interface import Chunk
-from offboard.mavlink.events import ESTIMATE, Attitude, EstimatorReport, GpsFix
+from offboard.mavlink.events import ESTIMATE, Attitude, EstimatorReport, GpsFix, VehicleFound
 from offboard.mavlink.senders import DIALECTS
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import UNITS_PER_S, Signing
@@ -447,6 +447,7 @@ def test_estimator_without_position_waits_then_blocks(boot_s: float, level: Leve
     )
     starting.heard_s[GpsFix] = starting.now_s
     session = Session(SessionSettings())
+    session.senders.set_vehicle(VehicleFound(1, 1, "px4"), None)
     model = load("flight").vehicle
     ground = Ground(limits=Limits(), session=session, model=model, vehicle=starting)
     assert {found.level for check, _, found in findings(ground) if check == "estimator"} == {level}
