@@ -25,7 +25,7 @@ SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 2.0  # where the ramp ends, in units of gravity
 SPOOL_UNSEEN = 0.9  # less than hover: without a new position the vehicle must not lift off or climb
 SPOOL_KNOWN_S = 0.2  # greatest age of a position that shows the height
-# Least and greatest height of an autopilot's own take-off, which setpoints replace on the way:
+# Least and greatest height of an autopilot's own takeoff, which setpoints replace on the way:
 # above the height that shows lift-off, and no higher than needed
 TAKEOFF_HEIGHTS_M = 1.5, 3.0
 DISARMING = (
@@ -81,7 +81,7 @@ def act_without_decision(flight: FlightState, time_s: float) -> None:
             return
     elif phase is not Phase.TAKEOFF and phase not in TRACKING:
         return
-    # Send none until the first decision has replaced the autopilot's own take-off
+    # Send none until the first decision has replaced the autopilot's own takeoff
     if math.isfinite(flight.setpoint_s):
         outbox.send_level(flight, time_s, command)
 
@@ -223,7 +223,7 @@ def _take_off(flight: FlightState, time_s: float) -> None:
 
 
 def _request_takeoff(flight: FlightState, time_s: float) -> None:
-    """Request the autopilot's own take-off. No setpoint is sent, because one without thrust would
+    """Request the autopilot's own takeoff. No setpoint is sent, because one without thrust would
     cancel it.
 
     Give the observer hover thrust as the command in force. The autopilot's thrust is close to it,

@@ -11,7 +11,7 @@ Jumps are resets of the vehicle's estimator. They are found without a message ab
 (ODOMETRY.reset_counter exists on PX4 only): two positions some milliseconds apart that are too far
 from each other for any motion show a jump.
 
-Before our setpoints replace the autopilot's own take-off, or its own mode in the air, the thrust
+Before our setpoints replace the autopilot's own takeoff, or its own mode in the air, the thrust
 that it reports (ATTITUDE_TARGET) and the acceleration of the vehicle show the hover thrust,
 whatever the vehicle file says and however fast the vehicle climbs.
 """

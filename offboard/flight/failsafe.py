@@ -24,7 +24,7 @@ FULL_THRUST = 0.99  # normalised
 # Share of the hover thrust at the start: an updraft never, and a lost payload hardly ever, reduces
 # the thrust so far
 LOW_THRUST = 0.5
-STANDS_BELOW_M = 0.25  # below the reference, which is at least 0.3 m above the take-off point
+STANDS_BELOW_M = 0.25  # below the reference, which is at least 0.3 m above the takeoff point
 THRUST_REPORT_S = 1.0  # greatest age of a ThrustReport that counts
 ESTIMATOR_REPORT_S = 0.7  # the same for an EstimatorReport; one alone must not hold for a second
 
@@ -45,7 +45,7 @@ def telemetry_old(flight: FlightState) -> str:
 
 
 def late_link(flight: FlightState) -> str:
-    """Growth of the link delay since take-off (TIMESYNC)."""
+    """Growth of the link delay since takeoff (TIMESYNC)."""
     growth_s = flight.clock.delay_growth_s
     exceeds = growth_s > flight.limits.link_growth_s
     return f"the delay of the link has grown by {growth_s:.2f} s" if exceeds else ""
@@ -133,17 +133,17 @@ def estimate_contradicts(flight: FlightState) -> str:
 
 
 def positioning_lost(flight: FlightState) -> str:
-    """Time without the GPS fix or external vision that the estimator had at take-off."""
+    """Time without the GPS fix or external vision that the estimator had at takeoff."""
     return flight.positioning.lost(flight.vehicle, flight.limits)
 
 
 def estimate_invalid(flight: FlightState) -> str:
-    """Loss, since take-off, of a valid position estimate or of its reports."""
+    """Loss, since takeoff, of a valid position estimate or of its reports."""
     return flight.positioning.invalid(flight.vehicle)
 
 
 def estimate_inaccurate(flight: FlightState) -> str:
-    """Accuracy of the position by its estimator, if it is twice as bad as at take-off."""
+    """Accuracy of the position by its estimator, if it is twice as bad as at takeoff."""
     return flight.positioning.inaccurate(flight.vehicle, flight.limits)
 
 
@@ -159,7 +159,7 @@ def measurements_rejected(flight: FlightState) -> str:
 
 
 def outside_volume(flight: FlightState) -> str:
-    """Height above the take-off point, and horizontal distance from it."""
+    """Height above the takeoff point, and horizontal distance from it."""
     return flight.outside_volume if flight.plan.reference else ""
 
 
@@ -191,7 +191,7 @@ def sinks_with_full_thrust(flight: FlightState) -> str:
 
 
 def stands_on_ground(flight: FlightState) -> str:
-    """Height of the reference above a vehicle that has stood at its take-off height for 1 s.
+    """Height of the reference above a vehicle that has stood at its takeoff height for 1 s.
 
     Does not apply in the climb, because a weak vehicle may be slow to leave the ground."""
     position, flies = flight.vehicle.position, flight.phase in TRACKING - {Phase.CLIMB}

@@ -36,7 +36,7 @@ from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, DISARMED_S
 from offboard.mavlink.events import GOOD_RESULTS, Heartbeat
 
-TAKE_OVER_HEIGHT_M = 1.0  # height at which setpoints replace the autopilot's own take-off
+TAKE_OVER_HEIGHT_M = 1.0  # height at which setpoints replace the autopilot's own takeoff
 DETECTOR_S = 1.0  # time for the land detector to report: EXTENDED_SYS_STATE is requested at 5 Hz
 # Time after the planned end of the climb, when the vehicle is identified though it is not at rest
 RESTLESS_S = 5.0
@@ -105,7 +105,7 @@ def no_lift_off(flight: FlightState) -> str:
     if flight.dialect is None or not flight.takes_off_by_command:
         return f"{after}; is hover_thrust in the vehicle file right?"
     return (
-        f"{after} by the autopilot's own take-off; does full thrust carry the vehicle, and is "
+        f"{after} by the autopilot's own takeoff; does full thrust carry the vehicle, and is "
         f"{flight.dialect.hover_parameter} right?"
     )
 
@@ -219,7 +219,7 @@ def out_of_reach(flight: FlightState) -> str:
     return (
         f"not heard for {flight.unreached_s:.0f} s while landing; last known: "
         f"{'armed' if vehicle.armed else 'disarmed'} in {vehicle.mode}, "
-        f"{height_m:.1f} m above the take-off point"
+        f"{height_m:.1f} m above the takeoff point"
     )
 
 

@@ -118,7 +118,7 @@ class Ground:
 
     @property
     def origin_missing(self) -> bool:
-        """Whether the reference is relative to a take-off point that is not known."""
+        """Whether the reference is relative to a takeoff point that is not known."""
         return False
 
     @property
@@ -303,7 +303,7 @@ def _reading(ground: Ground) -> str:
 
 
 def _origin(ground: Ground) -> str:
-    unseen = "its take-off point is not known, as it was not seen on the ground (--anchor origin)"
+    unseen = "its takeoff point is not known, as it was not seen on the ground (--anchor origin)"
     return unseen if ground.origin_missing else ""
 
 
@@ -367,7 +367,7 @@ def _estimate_level(ground: Ground) -> Level:
 
 def _outside_volume(ground: Ground) -> str:
     limits, where = ground.limits, ground.outside_volume
-    if not (where and ground.in_the_air):  # a vehicle on the ground is at its take-off point
+    if not (where and ground.in_the_air):  # a vehicle on the ground is at its takeoff point
         return ""
     named = f"limits.ceiling_m is {limits.ceiling_m:g}, limits.radius_m is {limits.radius_m:g}"
     return f"{where} ({named})"

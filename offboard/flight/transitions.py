@@ -238,7 +238,7 @@ def _begin_land(flight: FlightState, source: Phase) -> None:
 
 
 def _begin_climb(flight: FlightState, source: Phase) -> None:
-    """Plan the climb to the start of the reference: after take-off, after the pilot has engaged in
+    """Plan the climb to the start of the reference: after takeoff, after the pilot has engaged in
     the air, or for one more flight of the reference."""
     position = flight.vehicle.position
     assert position is not None

@@ -25,7 +25,7 @@ _CHUNK = 20_000
 
 
 class Envelope(NamedTuple):
-    """The greatest tilt, height above, and horizontal distance from the take-off point."""
+    """The greatest tilt, height above, and horizontal distance from the takeoff point."""
 
     tilt_rad: float
     height_m: float
@@ -48,7 +48,7 @@ def check(reference: Reference, vehicle: Vehicle, slower: str = "") -> Envelope:
     """Check that a vehicle can fly a reference without wind, and return its envelope. `slower` says
     how the reference becomes slower; it ends the error for a limit of the vehicle.
 
-    The reference, relative to the take-off point, is sampled every 10 ms. Raises ValueError for a
+    The reference, relative to the takeoff point, is sampled every 10 ms. Raises ValueError for a
     path that is too low or too far away, otherwise for the limit that is exceeded first. Times in
     the error are those of the path if the reference is a `Track`, as in the rows of a table.
     """

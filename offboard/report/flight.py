@@ -56,7 +56,7 @@ class Flight:
 
     @property
     def track_s(self) -> float:
-        """Vehicle time at which TRACK first began; without it that of the take-off, or else of the
+        """Vehicle time at which TRACK first began; without it that of the takeoff, or else of the
         first sample."""
         begun = begin_times(self.history.phases[::-1])
         return begun.get("track", begun.get("takeoff", self.begin_s))

@@ -138,7 +138,7 @@ def build_track(config: FlightConfig) -> Track:
         if reached_m > limit_m:  # the failsafe would end the flight there
             raise DocumentError(
                 f"reference {config.reference.title}: it goes {reached_m:.4g} m {where} the "
-                f"take-off point, beyond {limit} ({limit_m:g} m); fly nearer or raise the limit"
+                f"takeoff point, beyond {limit} ({limit_m:g} m); fly nearer or raise the limit"
             )
     with outside("controller"):
         refused = config.controller.refusal(track)

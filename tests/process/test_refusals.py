@@ -63,7 +63,7 @@ def test_invalid_sitl_options_are_refused_before_the_build(
         ("--set", "reference.height_m=100", "from 100 m takes 200 s at 0.5 m/s, longer than"),
         ("--reference hover --set", "reference.duration_s=0.2", "a score needs 0.3 s (3 periods)"),
         ("--reference racing --set", "reference.fastest.thrust_mps2=9.9", "than or equal to 10"),
-        ("--set", "limits.radius_m=1.5", "it goes 2 m away from the take-off point, beyond limits"),
+        ("--set", "limits.radius_m=1.5", "it goes 2 m away from the takeoff point, beyond limits"),
         ("--set", "vehicle.hover_thrust=0.92", "0.92 exceeds limits.hover_thrust (0.9)"),
         ("--set", "limits.tilt_rad=0.5", "tilt_max_rad 0.785 exceeds limits.tilt_rad (0.5)"),
         ("--set", SWARM, "particles x iterations must be at most 500000, not 1000000000"),
