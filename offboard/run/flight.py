@@ -326,9 +326,6 @@ def fly(
     simulated = isinstance(vehicle, Simulated)
     with ExitStack() as stack:
         stops = stops or stack.enter_context(StopRequests())
-        prepared = build(config)
-        log = FlightLog(directory, prepared.text, real_time=not simulated)
-        log.check()
         signing = vehicle.signing(stack)
         if isinstance(vehicle, Simulated):
             simulator = simulator or SimulatorProcess()
@@ -337,6 +334,9 @@ def fly(
         else:
             link = open_link(vehicle.address)
         stack.callback(link.close)
+        prepared = build(config)  # while the simulator starts
+        log = FlightLog(directory, prepared.text, real_time=not simulated)
+        log.check()
         supervisor = None if simulated else stack.enter_context(Supervisor(signing))
         tell("preparing the controller")
         prepare(tell)
