@@ -6,7 +6,7 @@ test suites are not slowed down.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +15,6 @@ import pytest
 
 if TYPE_CHECKING:
     from offboard.analysis.score import Score
-    from offboard.run.sitl import SimulatorProcess
 
 FLIGHTS = pytest.StashKey[list[Path]]()
 
@@ -40,19 +39,8 @@ class Flight:
         return self.directory / "flight.tlog"
 
 
-@pytest.fixture(scope="session")
-def _simulator() -> Iterator[SimulatorProcess]:
-    """The simulator process, shared by the flights of all tests."""
-    from offboard.run.sitl import SimulatorProcess
-
-    with SimulatorProcess() as simulator:
-        yield simulator
-
-
 @pytest.fixture
-def fly(
-    request: pytest.FixtureRequest, tmp_path: Path, _simulator: SimulatorProcess
-) -> Callable[..., Flight]:
+def fly(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[..., Flight]:
     """A function that flies on the bundled simulator and returns a `Flight`.
 
     The flight is flown in lockstep: the same arguments give the same telemetry and setpoints. All
@@ -94,6 +82,7 @@ def fly(
         from offboard.link.stop import StopRequests
         from offboard.run.configuration import load
         from offboard.run.flight import Simulated, fly
+        from offboard.run.sitl import InMemorySimulator
 
         directory = tmp_path / f"flight-{len(flown) + 1}"
         flown.append(directory / "flight.tlog")
@@ -109,8 +98,9 @@ def fly(
                 seed=seed,
                 known_vehicle=simulated.known_vehicle,
             )
+            simulator = InMemorySimulator()
             with StopRequests() as stops:
-                outcome = fly(flown_config, directory, simulated, simulator=_simulator, stops=stops)
+                outcome = fly(flown_config, directory, simulated, simulator=simulator, stops=stops)
             stops.check()  # Ctrl-C ends pytest, too
         except UserError as error:
             problem = str(error)

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-import sys
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
 from offboard.documents import shipped
 from offboard.documents.arguments import FILE, Command, option
-from offboard.documents.command_line import tell
 from offboard.documents.errors import UserError
 from simulator.options import COMPANION_PORT, NO_LINK, Options, Stop
 
@@ -23,9 +21,6 @@ GROUND_LINK = f"udpout:127.0.0.1:{GROUND_PORT}"
 LINKS = (
     "Flight link: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT.  "
     f"[default: udpout:127.0.0.1:{COMPANION_PORT}]"
-)
-PATIENCE = (
-    "With --lockstep: longest wait for the companion.  [default: 180 for its first message, then 5]"
 )
 EXIT_CODES = (
     "Exit codes: 0 stopped; 2 usage or configuration error; 3 (--lockstep) no companion answered, "
@@ -63,19 +58,14 @@ def simulate(
         int, option("N", "Number of the first vehicle: for system id and ports.", min=0, max=249)
     ] = 0,
     instances: Annotated[int, option("N", "Number of vehicles.", min=1, max=100)] = 1,
-    patience: Annotated[float | None, option("SECONDS", PATIENCE, min=0.1, max=600.0)] = None,
     signing_key: Annotated[
         Path | None, option("FILE", "Sign and require signatures, see `offboard key`.")
     ] = None,
     log: Annotated[
         Path | None, option("FILE", "Record the companion link as a .tlog; a new file.")
     ] = None,
-    check: Annotated[Path | None, option("FILE", "Check a scenario file and exit.")] = None,
     show_version: Annotated[
         bool, typer.Option("--version", help="Print the version and exit.")
-    ] = False,
-    list_scenarios: Annotated[
-        bool, typer.Option("--list-scenarios", help="List the shipped scenarios and exit.")
     ] = False,
 ) -> None:
     """Simulate vehicles that speak MAVLink as PX4 or ArduCopter does.
@@ -85,13 +75,8 @@ def simulate(
     if show_version:
         print(f"pso-offboard {version('pso-offboard')}")
         raise typer.Exit(0)
-    if list_scenarios:
-        _list_scenarios()
-    if check is not None:
-        _check(check)
-    for seconds, name in ((duration, "--duration"), (patience, "--patience")):
-        if seconds is not None and math.isnan(seconds):
-            raise UserError(f"{name} nan: must be a number")
+    if duration is not None and math.isnan(duration):
+        raise UserError("--duration nan: must be a number")
     _check_speed(speed, lockstep=lockstep)
     _check_numbers(instance, instances, lockstep=lockstep)
     stopping = Stop()
@@ -107,29 +92,12 @@ def simulate(
         parameters=tuple(param or ()),
         duration_s=math.inf if duration is None else duration,
         numbers=range(instance, instance + instances),
-        patience_s=patience,
         signing_key=signing_key,
         log=log,
     )
     from simulator.launch import launch  # imported late: a wrong option is reported at once
 
     raise typer.Exit(launch(options, stopping))
-
-
-def _check(path: Path) -> NoReturn:
-    from simulator import config
-
-    config.scenario(str(path if path.suffix in (".yaml", ".yml") else path.absolute()))
-    tell(f"{path}: scenario, valid", sys.stdout)
-    raise typer.Exit(0)
-
-
-def _list_scenarios() -> NoReturn:
-    from offboard.documents.reading import descriptions
-
-    for name, text in descriptions("scenario").items():
-        tell(f"{name:16}  {text}", sys.stdout)
-    raise typer.Exit(0)
 
 
 def _check_speed(speed: float | None, *, lockstep: bool) -> None:

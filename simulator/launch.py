@@ -66,7 +66,7 @@ def launch(options: Options, stopping: Stop) -> int:
     runner = Runner(endpoints, stopping, _warn, options.duration_s)
     silence = ""
     if options.lockstep:
-        silence = runner.lockstep(options.patience_s)
+        silence = runner.lockstep()
     else:
         runner.real_time(options.speed)
     if silence:

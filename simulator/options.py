@@ -26,7 +26,6 @@ class Options:
     parameters: tuple[str, ...]  # NAME=VALUE
     duration_s: float
     numbers: range
-    patience_s: float | None
     signing_key: Path | None
     log: Path | None
 

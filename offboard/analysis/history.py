@@ -90,8 +90,8 @@ class History:
     `vehicle_messages` (STATUSTEXT, refused commands) from the vehicle's messages. `vehicle` is the
     one that our vehicle record names, or else the first autopilot in the log, or None; only its
     messages and ours are used. `dialect` is None also for an unknown autopilot. `substitutes` are
-    the messages that took the place of missing ones, as in the log of a ground station. `damage`
-    says what was not read, damaged entries last; `damage_s` is the time of the newest telemetry
+    the messages that took the place of missing ones, as in the log of a ground station. `unread`
+    says what was not read, damaged entries last; `damaged_s` is the time of the newest telemetry
     before the first of them, or NaN.
     """
 
@@ -116,8 +116,8 @@ class History:
     messages: Counter[str]
     wall_s: float
     substitutes: tuple[str, ...] = ()
-    damage: str = ""
-    damage_s: float = math.nan
+    unread: str = ""
+    damaged_s: float = math.nan
 
     def estimates(self, constant: str) -> tuple[Array, Array]:
         """Return the times (N,) at which a constant was identified, its values and sd (N, 2)."""
@@ -138,10 +138,10 @@ def gather(log: Tlog, *, unix_times: bool = False) -> History:
     vehicle, dialect, others = _vehicle(log)
     collector = _Collector(vehicle, dialect, unix_times=unix_times)
     for entry in log:
-        if log.damaged and math.isnan(collector.damage_s):
-            collector.damage_s = collector.now_s
+        if log.damaged and math.isnan(collector.damaged_s):
+            collector.damaged_s = collector.now_s
         collector.add(entry)
-    return collector.history("; ".join(filter(None, (others, log.damage))))
+    return collector.history("; ".join(filter(None, (others, log.unread))))
 
 
 def configuration(log: Tlog) -> str | None:
@@ -178,7 +178,7 @@ class _Collector:
         self._clocks: tuple[int, ...] = TELEMETRY + _SUBSTITUTES
         self._time = VehicleTime()
         self.now_s = math.nan  # vehicle time of the newest telemetry
-        self.damage_s = math.nan  # vehicle time of the newest telemetry before the first damage
+        self.damaged_s = math.nan  # vehicle time of the newest telemetry before the first damage
 
     def add(self, entry: LoggedMessage) -> None:
         frame, vehicle = entry.frame, self._vehicle
@@ -284,7 +284,7 @@ class _Collector:
         elif self._origin is None:  # GPS_GLOBAL_ORIGIN is better: ArduCopter sends x, y, z = 0
             self._origin = origin_of(place, (at.x, at.y, at.z))
 
-    def history(self, damage: str) -> History:
+    def history(self, unread: str) -> History:
         """Return all messages that were added."""
         theirs, ours = (
             {kind: samples.rows() for kind, samples in kinds.items()}
@@ -331,8 +331,8 @@ class _Collector:
             messages=self._counts,
             wall_s=(self._unix_us[1] - self._unix_us[0]) / 1e6,
             substitutes=tuple(substitutes),
-            damage=damage,
-            damage_s=self.damage_s,
+            unread=unread,
+            damaged_s=self.damaged_s,
         )
 
 

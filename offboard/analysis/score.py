@@ -194,7 +194,7 @@ def as_text(score: Score, history: History) -> str:
         },
         "messages": dict(sorted(history.messages.items())),
         "wall_s": history.wall_s,
-        "damage": history.damage,
+        "unread": history.unread,
     }
     return json.dumps(plain(document), indent=2, allow_nan=False) + "\n"
 

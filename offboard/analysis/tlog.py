@@ -91,7 +91,7 @@ class Tlog:
         self.damaged = self.first_damage = self.truncated = self.second_flight = 0
 
     @property
-    def damage(self) -> str:
+    def unread(self) -> str:
         """One sentence that says what was not read; empty if everything was."""
         said = []
         if self.second_flight:

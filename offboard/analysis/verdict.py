@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 REFERENCE_OVER = "reference over"
 NO_FLIGHT = "no flight of offboard in this log"
 _ON_GROUND = 1  # MAV_LANDED_STATE
-_LOWEST_M = 0.05  # least height above the take-off point; references are at least 0.3 m above it
+_LOWEST_M = 0.05  # least height above the takeoff point; references are at least 0.3 m above it
 _LANDING_ENDS = {"disarmed", "failed", "yielded"}
 
 
@@ -37,7 +37,7 @@ def landing(flown: History) -> tuple[str, float]:
     """Return what is wrong with the landing, and the downward speed at touch-down (m/s, or NaN).
 
     The text says why the vehicle has not landed, or that it came down to the ground between the
-    climb and the landing of a flight with a take-off. It is empty if nothing is wrong.
+    climb and the landing of a flight with a takeoff. It is empty if nothing is wrong.
     """
     begun, first = begin_times(flown.phases), begin_times(flown.phases[::-1])
     takes_off_s, lands_s = (begun.get(phase, math.inf) for phase in ("takeoff", "land"))

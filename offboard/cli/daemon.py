@@ -32,7 +32,7 @@ def daemon(
     options: FlightOptions,
     anchor: Annotated[
         Literal["here", "origin"],
-        typer.Option(help="Reference: start where the vehicle stops, or relative to the take-off."),
+        typer.Option(help="Reference: start where the vehicle stops, or relative to the takeoff."),
     ] = "here",
     then: Annotated[
         Literal["hold", "land", "repeat"], typer.Option(help="After the reference.")
@@ -67,7 +67,7 @@ def daemon(
 
     Exit codes: 0 stopped while no vehicle follows it; 2 usage or configuration error, nothing
     sent; 3 cannot begin now (another daemon has the connection, the disk is full), or stopped
-    before a take-off; 4 ended before the vehicle was handed back, or left armed.
+    before a takeoff; 4 ended before the vehicle was handed back, or left armed.
     """
     if print_unit:
         options.load()

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -25,11 +25,11 @@ from offboard.cli.shared import (
     write,
 )
 from offboard.documents.arguments import LIVE_PAGE, option
-from offboard.documents.command_line import INTERRUPT, complain, drop, explained
+from offboard.documents.command_line import INTERRUPT, complain, drop, explained, told
 from offboard.documents.errors import UserError, plain, typed
 
 if TYPE_CHECKING:
-    from offboard.analysis.score import Requirement
+    from offboard.analysis.score import Requirement, Score
     from offboard.flight.phases import Outcome
 
 INTERRUPTED = "interrupted before anything was sent"
@@ -69,13 +69,8 @@ def fly(
     """
     try:
         from offboard.link.stop import StopRequests
-        from offboard.run.sitl import SimulatorProcess
 
-        with (
-            StopRequests(_exit_at_once) as stops,
-            SimulatorProcess() if options.sitl else nullcontext() as simulator,
-            ExitStack() as stack,
-        ):
+        with StopRequests(_exit_at_once) as stops, ExitStack() as stack:
             from offboard.analysis.score import Requirement
             from offboard.link import clock
             from offboard.live.lines import JsonLines, Terminal
@@ -94,7 +89,6 @@ def fly(
                 flight,
                 directory,
                 flown,
-                simulator=simulator,
                 stops=stops,
                 progress=displays.show,
                 tell=displays.tell,
@@ -106,85 +100,92 @@ def fly(
     if outcome.exit_code == 2:
         raise UserError(outcome.sentence)
     try:
-        _conclude(outcome, directory, requirements, displays.lost, page=page, json_lines=json_lines)
+        result = _judged(outcome, directory, requirements)
+        try:
+            if json_lines:
+                write(result.as_json(directory, displays.lost))
+            else:
+                result.show(directory, displays.lost, page)
+        except OSError as error:
+            drop(sys.stdout)
+            complain(f"{result.outcome.sentence}; {explained(error)}")
     finally:
         if report:
             from offboard.link.after_flight import begin_report
 
             begin_report(directory)
+    if result.code:
+        raise typer.Exit(result.code)
 
 
 def _exit_at_once() -> None:
-    """Exit at once, even while functions are compiled. The simulator ends as its pipe closes."""
+    """Exit, even while functions are compiled. The simulator ends as its pipe closes."""
     os.write(2, f"{INTERRUPTED}\n".encode())
     os._exit(INTERRUPT)
 
 
-def _conclude(
-    outcome: Outcome,
-    directory: Path,
-    requirements: list[Requirement],
-    lost: list[str],
-    *,
-    page: str,
-    json_lines: bool,
-) -> None:
-    """Print verdict and result, and exit with the code of the verdict.
+class Result(NamedTuple):
+    """What `fly` prints after the flight. `rows` are texts by label, `requirements` is a sentence
+    about the requirements that were checked, and `code` is the exit code."""
 
-    If the flight cannot be scored, for example because its log was deleted meanwhile, every
-    requirement is missed. `lost` are sentences about the parts of the flight that were not shown;
-    `page` is the path of the report that is about to be written, empty without one.
-    """
+    outcome: Outcome
+    score: Score
+    rows: dict[str, str]
+    requirements: str
+    code: int
+
+    def as_json(self, directory: Path, lost: list[str]) -> str:
+        """The last line of --json-lines. `lost` are sentences about what was not shown."""
+        from offboard.live.display import DIGITS, line
+
+        result = line(
+            "result",
+            exit_code=self.code,
+            sentence=self.outcome.sentence,
+            requirements=self.requirements,
+            completed=self.score.completed == 1.0,
+            ended_by=self.score.ended_by,
+            directory=str(directory),
+            lost=lost,
+            figures=plain(self.score.metrics(), DIGITS),
+        )
+        return f"{result}\n"
+
+    def show(self, directory: Path, lost: list[str], page: str) -> None:
+        """Print the result. `page`: path of the report that is about to be written, or empty."""
+        out.print()
+        for sentence in lost:
+            say(sentence)
+        log, verdict, rows = directory / "flight.tlog", self.outcome.sentence, dict(self.rows)
+        if self.outcome.exit_code:
+            verdict += f" (log: {log})"
+        elif self.requirements:
+            verdict += f"; requirement {'missed' if self.code else 'met'}: {self.requirements}"
+        (complain if self.code else say)(verdict)
+        if log.exists():
+            rows |= {"log": str(log), "all metrics": typed("offboard", "score", directory)}
+            rows |= {"report": f"{page}, in some seconds"} if page else {}
+        say_each(rows)
+        sys.stdout.flush()
+
+
+def _judged(outcome: Outcome, directory: Path, requirements: list[Requirement]) -> Result:
+    """Score the flight and check its requirements. If it cannot be scored, for example because its
+    log was deleted meanwhile, every requirement is missed, and the exit code stays that of the
+    flight."""
     from offboard.analysis.score import Score, judged
     from offboard.analysis.score_table import summary
-    from offboard.live.display import DIGITS, line
 
-    log = str(directory / "flight.tlog")
+    rows: dict[str, str] = {}
     try:
         score, history = scored(directory)
         outcome, rows = judged(outcome, score), summary(score, history)
-    except (UserError, KeyboardInterrupt) as error:
-        score = Score(ended_by=f"it cannot be scored: {str(error) or 'interrupted'}")
-        rows = {"log": log} if isinstance(error, KeyboardInterrupt) else {}
-        page = page if rows else ""
+    except BaseException as error:
+        sentence, _ = told(error)
+        score = Score(ended_by=f"it cannot be scored: {sentence}")
         outcome = replace(outcome, sentence=f"{outcome.sentence}; {score.ended_by}")
     metrics = score.metrics()
     checked = [] if outcome.exit_code else requirements
     missed = [each for each in checked if not each.met(metrics)]
-    results = "; ".join(each.sentence(metrics) for each in missed or checked)
-    code = outcome.exit_code or int(bool(missed))
-    try:
-        if json_lines:
-            result = line(
-                "result",
-                exit_code=code,
-                sentence=outcome.sentence,
-                requirements=results,
-                completed=score.completed == 1.0,
-                ended_by=score.ended_by,
-                directory=str(directory),
-                lost=lost,
-                figures=plain(metrics, DIGITS),
-            )
-            write(f"{result}\n")
-            raise typer.Exit(code)
-        out.print()
-        for sentence in lost:
-            say(sentence)
-        verdict = outcome.sentence
-        if outcome.exit_code:
-            verdict += f" (log: {log})"
-        elif results:
-            verdict += f"; requirement {'missed' if missed else 'met'}: {results}"
-        (complain if code else say)(verdict)
-        if rows:
-            rows |= {"log": log, "all metrics": typed("offboard", "score", directory)}
-        if page:
-            rows["report"] = f"{page}, in some seconds"
-        say_each(rows)
-        sys.stdout.flush()
-    except OSError as error:  # the exit code stays that of the flight
-        drop(sys.stdout)
-        complain(f"{outcome.sentence}; {explained(error)}")
-    if code:
-        raise typer.Exit(code)
+    sentences = "; ".join(each.sentence(metrics) for each in missed or checked)
+    return Result(outcome, score, rows, sentences, outcome.exit_code or int(bool(missed)))

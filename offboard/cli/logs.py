@@ -56,8 +56,8 @@ def score(
         write(as_text(result, history))
     else:
         show(out, result, history)
-    if history.damage:
-        complain(history.damage)
+    if history.unread:
+        complain(history.unread)
     metrics = result.metrics()
     missed = [each.sentence(metrics) for each in requirements if not each.met(metrics)]
     if requirements and result.completed != 1.0:
@@ -113,8 +113,8 @@ def replay(flight: Annotated[Path, FLIGHT]) -> None:
     from offboard.replay.replaying import Replay, read
 
     recording = read(flight)
-    if recording.log.damage:
-        complain(recording.log.damage)
+    if recording.log.unread:
+        complain(recording.log.unread)
     replayed = Replay(recording)
     with err.status("replaying") as status:
         comparison = verdict(replayed, status.update)
@@ -152,8 +152,8 @@ def export(
     found = read(flight)
     write = {"mcap": write_mcap, "csv": write_csv, "ulog": write_ulog}[to]
     write(found, output)
-    if found.damage:
-        complain(found.damage)
+    if found.unread:
+        complain(found.unread)
     held = ", ".join(f"{len(rows)} of {name}" for name, rows in series_of(found).items())
     say(f"{output}: samples: {held}; {len(events_of(found))} events")
 
@@ -200,8 +200,8 @@ def identify(
     recorded = read(flight)
     known = None if options.vehicle else recorded.configuration
     prior = (flown(known) if known is not None else options.load()).vehicle
-    if recorded.history.damage:
-        complain(recorded.history.damage)
+    if recorded.history.unread:
+        complain(recorded.history.unread)
     found, trace = identify_flight(recorded.history, prior)
     named = prior.model_copy(update={"name": output.stem[:40] if output else "identified"})
     text = vehicle_file(found, named, recorded.name)

@@ -25,7 +25,7 @@ class Situation:
 
     Attributes:
         time_s: Vehicle time of the tick (`time_boot_ms` of the newest telemetry) plus the increase
-            of the link delay since take-off, s.
+            of the link delay since takeoff, s.
         state: The state predicted for the time at which a command sent now takes effect,
             `state.time_s`.
         reference: The trajectory to follow. Its time axis is vehicle time, its positions are in
@@ -34,7 +34,7 @@ class Situation:
         remaining_s: Returns how many seconds of the time budget of this decision are left,
             negative once it is exceeded. None in lockstep, where the vehicle waits.
         origin_ned_m: The point to which configured references and keep-out volumes are relative:
-            the take-off point, unless a service placed the reference where the vehicle stopped.
+            the takeoff point, unless a service placed the reference where the vehicle stopped.
         track_time_s: Time since the start of the configured reference, s; NaN during the climb.
     """
 
@@ -101,7 +101,7 @@ class DecisionError(ArithmeticError):
 class Controller(Protocol):
     """A control law. The flight calls these two methods, and those of `Adaptive` if it has them.
 
-    Before take-off `decide` is called a few times for a vehicle at rest, so that everything is
+    Before takeoff `decide` is called a few times for a vehicle at rest, so that everything is
     compiled and loaded, and `reset` once after that; an exception in one of these calls ends the
     program before anything is sent. In flight `decide` is called at every control tick from the
     climb to the landing.
@@ -151,7 +151,7 @@ class ControllerSettings(Parameters, ABC):
 
     def refusal(self, reference: Reference) -> str | None:
         """Return why these settings cannot fly `reference`, or None if they can. `reference` is
-        relative to the take-off point. Called before anything is sent."""
+        relative to the takeoff point. Called before anything is sent."""
         return None
 
 

@@ -1,6 +1,6 @@
 """Keep-out volumes (spheres, upright cylinders, boxes, at rest or moving) and the distance to them.
 
-Positions are given as in references: metres north and east of the take-off point, and above it.
+Positions are given as in references: metres north and east of the takeoff point, and above it.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ KeepOut = Annotated[Volume, Field(discriminator="shape")]
 
 
 def pack(volumes: Sequence[Volume]) -> Array:
-    """Return the volumes as (V, PACKED_SIZE), NED, relative to the take-off point."""
+    """Return the volumes as (V, PACKED_SIZE), NED, relative to the takeoff point."""
     rows = [
         (
             *(each.north_m, each.east_m, -each.height_m),
@@ -125,7 +125,7 @@ def placed_at(volumes: Array, origin_ned_m: Array, track_time_s: float) -> Array
 
 def clearances(volumes: Sequence[Volume], times_s: Array, positions_ned_m: Array) -> Array:
     """Return the distance (n,) to the nearest volume, m, at times (n,) since the start of the
-    reference and positions (n, 3) relative to the take-off point; inf without volumes."""
+    reference and positions (n, 3) relative to the takeoff point; inf without volumes."""
     packed, origin = pack(volumes), np.zeros(3)
     nearest = np.full(len(times_s), np.inf)
     for i, (time_s, position) in enumerate(zip(times_s, positions_ned_m, strict=True)):
@@ -136,7 +136,7 @@ def clearances(volumes: Sequence[Volume], times_s: Array, positions_ned_m: Array
 
 
 def refusal(volumes: Sequence[Volume], clearance_m: float, reference: Reference) -> str | None:
-    """Return why `reference`, relative to the take-off point, conflicts with the volumes, or None
+    """Return why `reference`, relative to the takeoff point, conflicts with the volumes, or None
     if it does not."""
     times = np.arange(0.0, reference.duration_s + CHECK_STEP_S, CHECK_STEP_S)
     path = reference.sample(times).position_ned_m
@@ -144,7 +144,7 @@ def refusal(volumes: Sequence[Volume], clearance_m: float, reference: Reference)
         gaps = clearances((volume,), times, path)
         ground = clearances((volume,), np.zeros(1), np.zeros((1, 3)))[0]
         for what, inside, gap in (
-            ("take-off point", ground < clearance_m, ground),
+            ("takeoff point", ground < clearance_m, ground),
             ("whole path", (gaps < clearance_m).all(), None),
             ("start of the reference", gaps[0] < clearance_m, gaps[0]),
             ("end of the reference", gaps[-1] < clearance_m, gaps[-1]),

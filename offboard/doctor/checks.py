@@ -1,7 +1,8 @@
 """Checks of the link, the vehicle and the planned flight, in addition to the preflight list.
 
 A check is a function of an `Observation`; it returns nothing if there is nothing to report. Those
-in OF_VEHICLE run only if a vehicle was found. The docstring of a check is its line in `--list`.
+in OF_VEHICLE run only if a vehicle of a fit type was found. The docstring of a check is its line in
+`--list`.
 """
 
 from __future__ import annotations
@@ -195,7 +196,7 @@ def rates(seen: Observation) -> Iterable[Finding]:
     if not seen.rates_requested:
         yield ok(f"{figures}; not requested, since the vehicle is armed")
     elif slow:
-        yield warn(f"slower than requested: {', '.join(slow)}", seen.dialect.slow_hint)
+        yield warn(f"slower than requested: {', '.join(slow)}", seen.known_dialect.slow_hint)
     else:
         yield ok(figures)
 
@@ -224,7 +225,7 @@ def clock(seen: Observation) -> Iterable[Finding]:
 
 def firmware(seen: Observation) -> Iterable[Finding]:
     """Version of the autopilot, and known defects of that version."""
-    version, dialect = seen.vehicle.version, seen.dialect
+    version, dialect = seen.vehicle.version, seen.known_dialect
     if version is None:
         yield warn("no reply for AUTOPILOT_VERSION")
         return
@@ -275,7 +276,7 @@ def gps(seen: Observation) -> Iterable[Finding]:
     found = names.get(fix_type, f"fix type {fix_type}")
     report = seen.vehicle.estimator
     if report and not report.problem:
-        hints = "check that it has another source", seen.dialect.without_gps
+        hints = "check that it has another source", seen.known_dialect.without_gps
         yield warn(
             f"{found}; the estimator still has a position", ", and ".join(filter(None, hints))
         )
@@ -313,8 +314,8 @@ def parameters(seen: Observation) -> Iterable[Finding]:
     """Parameters of the autopilot, with the line that sets each."""
     known, health = seen.vehicle.parameters, seen.vehicle.health
     radio, good = health is not None and health.radio_ok, []
-    unanswered = [parameter.name for parameter in seen.dialect.unanswered(known)]
-    for parameter in seen.dialect.watched_parameters:
+    unanswered = [parameter.name for parameter in seen.known_dialect.unanswered(known)]
+    for parameter in seen.known_dialect.watched_parameters:
         name, value = parameter.name, known.get(parameter.name)
         if value is None:
             continue
@@ -342,7 +343,7 @@ def configuration(seen: Observation) -> Iterable[Finding]:
 
 
 def _hover(seen: Observation) -> Iterable[Finding]:
-    vehicle, name = seen.config.vehicle, seen.dialect.hover_parameter
+    vehicle, name = seen.config.vehicle, seen.known_dialect.hover_parameter
     assumed, told = vehicle.hover_thrust, seen.vehicle.parameters.get(name)
     if vehicle.name == UNKNOWN_VEHICLE or not told:
         return
@@ -356,7 +357,7 @@ def _hover(seen: Observation) -> Iterable[Finding]:
 
 
 def _tilt(seen: Observation, needed_rad: float) -> Iterable[Finding]:
-    for name, unit in seen.dialect.tilt_parameters.items():
+    for name, unit in seen.known_dialect.tilt_parameters.items():
         value = seen.vehicle.parameters.get(name)
         if value is not None and needed_rad > value * unit:
             enough = math.ceil(math.degrees(needed_rad) + 1.0) * math.radians(1.0) / unit

@@ -19,7 +19,7 @@ from offboard.flight.preflight import Ground, ParameterReading
 from offboard.flight.timing import VehicleClock
 from offboard.link.interface import Chunk, peer_name
 from offboard.mavlink.decode import FIX_3D
-from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage, id_of
+from offboard.mavlink.dialects.base import TYPE_GCS, WantedMessage, id_of
 from offboard.mavlink.events import (
     Attitude,
     ClockBehind,
@@ -269,12 +269,6 @@ class Observation(Ground):
     @property
     def found(self) -> VehicleFound | None:
         return self.session.vehicle
-
-    @property
-    def dialect(self) -> Dialect:
-        """Dialect of the vehicle, which must have been found."""
-        assert self.session.dialect is not None
-        return self.session.dialect
 
     def complete(self, now_s: float) -> bool:
         """Whether the pass ends: all requests were answered, or its time is over."""

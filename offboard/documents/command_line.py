@@ -41,13 +41,13 @@ def run(module: str, arguments: list[str] | None = None) -> NoReturn:
     try:
         _call(module, sys.argv[1:] if arguments is None else arguments)
     except BaseException as error:
-        sentence, code = _told(error)
+        sentence, code = told(error)
     try:
         sys.stdout.flush()
     except OSError as error:
         drop(sys.stdout)
-        told, failed = _told(error)
-        sentence, code = sentence or told, code or failed
+        said, failed = told(error)
+        sentence, code = sentence or said, code or failed
     if sentence:
         complain(sentence)
     raise SystemExit(code)
@@ -62,7 +62,7 @@ def _call(module: str, arguments: list[str]) -> None:
         command.invoke(context)
 
 
-def _told(error: BaseException) -> tuple[str, int]:
+def told(error: BaseException) -> tuple[str, int]:
     """Sentence and exit code for the error that ended a command. Any other exception is a bug and
     is raised again."""
     if isinstance(error, KeyboardInterrupt):

@@ -20,7 +20,7 @@ from pydantic import BaseModel, ValidationError
 from yaml.representer import SafeRepresenter
 
 from offboard.documents.errors import DocumentError, abridged, counted, meant, shown
-from offboard.documents.shipped import KINDS, folder, locate, read_text
+from offboard.documents.shipped import KINDS, NAMING, beside, folder, locate, read_text
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -57,24 +57,24 @@ def descriptions(kind: str) -> dict[str, str]:
 
 
 def load_document(name: str, kind: str, model: type[M]) -> tuple[M, str]:
-    """Load and validate a file, given by shipped name or path. Returns the value, and the path for
-    error messages. Raises DocumentError."""
+    """Load and validate a file, given by shipped name or path; paths in it are relative to it.
+    Returns the value, and the path for error messages. Raises DocumentError."""
     path = locate(name, kind)
-    return parse(read_text(path), model, str(path), kind), str(path)
+    raw = read(read_text(path), str(path), kind)
+    named = beside(raw, path) if kind in NAMING else raw
+    return validate(named, model, str(path)), str(path)
 
 
 def parse(text: str, model: type[M], source: str, kind: str = "") -> M:
     """Convert YAML `text` to an instance of `model`. `source` names the text in errors (a file
-    name). `kind`, one of KINDS, is the kind of file that is expected; empty: any.
-
-    Raises DocumentError with the problems found.
-    """
+    name), for `kind` see `read`. Raises DocumentError with the problems found."""
     return validate(read(text, source, kind), model, source)
 
 
 def read(text: str, source: str, kind: str = "") -> Section:
     """Convert YAML `text` to a raw mapping, which is not validated yet. An empty document is an
-    empty mapping. Raises DocumentError, also if a key shows that the file is of another kind.
+    empty mapping. `kind`, one of KINDS, is the kind of file that is expected; empty: any. Raises
+    DocumentError, also if a key shows that the file is of another kind.
 
     Every file may have a `description`, a line that `offboard list` prints. It describes the file
     and not the value: it is removed here, so that it is not recorded beside values that --set has

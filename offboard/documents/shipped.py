@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from offboard.documents.errors import DocumentError, abridged, meant, shown
 
@@ -29,6 +30,8 @@ KINDS = {
     "tuning": ("tunings", {"training", "validation"}),
     "configuration": ("", set(PARTS)),
 }  # fmt: skip
+
+NAMING = ("campaign", "tuning")  # the kinds whose texts are names of files
 
 
 def directory() -> Path:
@@ -75,6 +78,17 @@ def locate(name: str, kind: str, others: Sequence[str] = ()) -> Path:
     raise DocumentError(
         f"there is no {kind} named {shown(name)}{near} known are {', '.join(known)}"
     )
+
+
+def beside(named: Any, path: Path) -> Any:
+    """What the file `path` names, a value of any kind, with its paths relative to that file."""
+    if isinstance(named, dict):
+        named.update({key: beside(value, path) for key, value in named.items()})
+    elif isinstance(named, list):
+        return [beside(value, path) for value in named]
+    elif isinstance(named, str) and is_file(named):
+        return str(path.parent / named)
+    return named
 
 
 def read_text(path: Path) -> str:

@@ -259,7 +259,7 @@ class Observer:
     @property
     def hover_thrust_estimate(self) -> float:
         """Normalised hover thrust, u_h (1 + d_z / g); within 3 % of the true value five seconds
-        after take-off."""
+        after takeoff."""
         down = float(self._state[DISTURBANCE + 2])
         return self._vehicle.hover_thrust * (1.0 + down / self._vehicle.gravity_mps2)
 
@@ -273,7 +273,7 @@ class Observer:
 
     def on_command(self, time_s: float, command: Command) -> None:
         """Store a command that was sent. The delays of the vehicle model count from `time_s`: the
-        vehicle time of the newest telemetry, plus the growth of the link delay since take-off."""
+        vehicle time of the newest telemetry, plus the growth of the link delay since takeoff."""
         north, east, _ = command.thrust_direction_ned
         if len(self._sent):
             time_s = max(time_s, float(self._sent[-1, SENT_AT]))

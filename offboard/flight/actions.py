@@ -11,7 +11,6 @@ from offboard.flight.ground_contact import STANDING_S, STILL_ARMED
 from offboard.flight.phases import BEFORE_FLIGHT, FLYING, OUTAGE_MAX_S, TRACKING, Phase
 from offboard.flight.preflight import other_sender
 from offboard.flight.state import LEVEL_DIRECTION, FlightState
-from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.events import Heartbeat, ModeReport, VehicleIdentity
 from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command
@@ -26,7 +25,7 @@ SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 2.0  # where the ramp ends, in units of gravity
 SPOOL_UNSEEN = 0.9  # less than hover: without a new position the vehicle must not lift off or climb
 SPOOL_KNOWN_S = 0.2  # greatest age of a position that shows the height
-# Least and greatest height of an autopilot's own take-off, which setpoints replace on the way:
+# Least and greatest height of an autopilot's own takeoff, which setpoints replace on the way:
 # above the height that shows lift-off, and no higher than needed
 TAKEOFF_HEIGHTS_M = 1.5, 3.0
 DISARMING = (
@@ -50,7 +49,7 @@ def act(flight: FlightState) -> None:
     elif flight.phase is Phase.TAKEOFF:
         _take_off(flight, time_s)
     elif flight.phase not in TRACKING:
-        act_without_telemetry(flight, time_s)
+        act_without_decision(flight, time_s)
     elif flight.authority.permits_setpoint(flight.now_s) and not decision.decide(flight):
         outbox.send_level(flight, time_s, _level(flight))
     waits_aloft = flight.phase is Phase.STANDBY and flight.in_the_air
@@ -69,8 +68,9 @@ def _request_heartbeat(flight: FlightState) -> None:
         outbox.send_request(flight, request)
 
 
-def act_without_telemetry(flight: FlightState, time_s: float) -> None:
-    """Send what needs no telemetry: level setpoints, and the requests that end the flight."""
+def act_without_decision(flight: FlightState, time_s: float) -> None:
+    """Send what needs no decision and no telemetry: level setpoints, and the requests that end the
+    flight."""
     phase, command = flight.phase, _level(flight)
     if phase is Phase.STAND_DOWN:
         outbox.request(flight, CommandLong.disarm())
@@ -81,14 +81,14 @@ def act_without_telemetry(flight: FlightState, time_s: float) -> None:
             return
     elif phase is not Phase.TAKEOFF and phase not in TRACKING:
         return
-    # Send none until the first decision has replaced the autopilot's own take-off
+    # Send none until the first decision has replaced the autopilot's own takeoff
     if math.isfinite(flight.setpoint_s):
         outbox.send_level(flight, time_s, command)
 
 
 def _end(flight: FlightState) -> None:
     """Request hold or land."""
-    dialect, authority = _dialect(flight), flight.authority
+    dialect, authority = flight.known_dialect, flight.authority
     holds = flight.phase is not Phase.LAND
     if not holds:
         _await_link(flight)
@@ -144,7 +144,7 @@ def _prepare(flight: FlightState, time_s: float) -> None:
         _stand_by(flight, time_s)
         return
     if flight.phase is Phase.ENGAGE:
-        outbox.request(flight, _dialect(flight).engage())
+        outbox.request(flight, flight.known_dialect.engage())
     elif flight.phase is Phase.ARM:
         outbox.request(flight, CommandLong.arm())
     # On the ground without thrust, in the air with hover thrust
@@ -184,15 +184,15 @@ def _flown(flight: FlightState) -> Command:
 
 def request_parameters(flight: FlightState) -> None:
     """In HEALTH, request what decides whether the vehicle can be flown. It needs no telemetry."""
-    due = flight.reading.due(_dialect(flight), flight.vehicle)
+    due = flight.reading.due(flight.known_dialect, flight.vehicle)
     outbox.send(flight, *due)
     if flight.service:
         if flight.vehicle.age_s(VehicleIdentity) > flight.in_phase_s:
             outbox.request(flight, CommandLong.message(AUTOPILOT_VERSION))
         return
-    stale = flight.vehicle.mode == _dialect(flight).engage_mode and flight.vehicle.disarmed
+    stale = flight.vehicle.mode == flight.known_dialect.engage_mode and flight.vehicle.disarmed
     if stale and not flight.vehicle.prearm_ok:  # PX4 returns to OFFBOARD after a landing
-        outbox.request(flight, _dialect(flight).hold())
+        outbox.request(flight, flight.known_dialect.hold())
 
 
 def _fit_telemetry(flight: FlightState) -> None:
@@ -223,7 +223,7 @@ def _take_off(flight: FlightState, time_s: float) -> None:
 
 
 def _request_takeoff(flight: FlightState, time_s: float) -> None:
-    """Request the autopilot's own take-off. No setpoint is sent, because one without thrust would
+    """Request the autopilot's own takeoff. No setpoint is sent, because one without thrust would
     cancel it.
 
     Give the observer hover thrust as the command in force. The autopilot's thrust is close to it,
@@ -231,7 +231,7 @@ def _request_takeoff(flight: FlightState, time_s: float) -> None:
     """
     least_m, most_m = TAKEOFF_HEIGHTS_M
     height_m = -float(flight.plan.track.sample(0.0).position_ned_m[2])
-    outbox.request(flight, _dialect(flight).take_off(min(max(height_m, least_m), most_m)))
+    outbox.request(flight, flight.known_dialect.take_off(min(max(height_m, least_m), most_m)))
     hovering = Command(flight.model.gravity_mps2, LEVEL_DIRECTION, flight.vehicle.heading_rad)
     outbox.set_command(flight, time_s, hovering)
 
@@ -244,8 +244,3 @@ def _level(flight: FlightState) -> Command:
     if flight.plan.reference is not None:
         thrust_mps2 = outbox.hover_mps2(flight)
     return Command(thrust_mps2, LEVEL_DIRECTION, flight.command.heading_rad)
-
-
-def _dialect(flight: FlightState) -> Dialect:
-    assert flight.dialect is not None
-    return flight.dialect

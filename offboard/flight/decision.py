@@ -63,7 +63,7 @@ def decide(flight: FlightState) -> bool:
         return False
     was_old = failsafe.telemetry_old(flight)
     try:
-        decided = _decided(flight)
+        decided = _call_law(flight)
         _send(flight, decided)
     except Exception as error:  # any error: the vehicle is in the air
         _miss(flight, located(error), "controller", DECISION_FAILED)
@@ -132,7 +132,7 @@ def _identify(flight: FlightState, identification: Learner) -> None:
         outbox.warn(flight, f"identification stopped: {located(error)}")
 
 
-def _decided(flight: FlightState) -> Decided:
+def _call_law(flight: FlightState) -> Decided:
     plan = flight.plan
     assert plan.reference is not None
     time_s = flight.delays_begin_s(flight.time_s)

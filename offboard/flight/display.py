@@ -128,9 +128,9 @@ class Snapshot:
         self.telemetry_age_s = age_s if math.isfinite(age_s) else math.nan
         self.link_delay_s = link.value if link else math.nan  # telemetry and setpoint together
         self.link_delay_sd_s = link.sd if link else math.nan
-        self.link_growth_s = state.clock.growth.added_s  # since take-off
+        self.link_growth_s = state.clock.growth.added_s  # since takeoff
         self.missed_decisions = state.missed_decisions  # in a row
-        self.skipped_ticks = state.busyness.skipped  # in pauses of this process, since take-off
+        self.skipped_ticks = state.busyness.skipped  # in pauses of this process, since takeoff
         self.computer = state.busyness.sentence  # if it is too busy; empty if it keeps up
         self.battery = math.nan if charge is None else charge  # remaining charge, 0 .. 1
         self.other_datagrams = state.other_datagrams  # of other senders, since the start

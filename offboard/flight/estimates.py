@@ -11,7 +11,7 @@ Jumps are resets of the vehicle's estimator. They are found without a message ab
 (ODOMETRY.reset_counter exists on PX4 only): two positions some milliseconds apart that are too far
 from each other for any motion show a jump.
 
-Before our setpoints replace the autopilot's own take-off, or its own mode in the air, the thrust
+Before our setpoints replace the autopilot's own takeoff, or its own mode in the air, the thrust
 that it reports (ATTITUDE_TARGET) and the acceleration of the vehicle show the hover thrust,
 whatever the vehicle file says and however fast the vehicle climbs.
 """
@@ -70,30 +70,38 @@ class Positioning:
             self.reports_silent_s = _silent_s(rates_hz.get(estimator, 0.0))
 
     def lost(self, vehicle: VehicleState, limits: Limits) -> str:
-        """What is lost, as a sentence; empty if nothing is."""
-        fix_age_s, before, now = vehicle.age_s(GpsFix), self.report, vehicle.estimator
+        """Which fix or vision is lost, as a sentence; empty if none is."""
+        fix_age_s, unmeasured_s = vehicle.age_s(GpsFix), vehicle.unmeasured_s
         if self.had_fix and fix_age_s > limits.gps_s and vehicle.age_s(NoFix) < fix_age_s:
             return f"GPS has no fix for {fix_age_s:.1f} s"
         if self.had_fix and fix_age_s > max(self.fixes_silent_s, limits.gps_s):
             return f"no GPS_RAW_INT for {fix_age_s:.1f} s"
-        if before is None or now is None:
-            return ""
-        missing = sorted(before.valid - now.valid)
-        if missing:
-            return f"its estimator has no valid {', '.join(missing)} any more"
-        if before.accuracy_m is not None and before.valid:
-            if now.accuracy_m is None:
-                return "its estimator reports no accuracy of the position any more"
-            if now.accuracy_m > max(limits.accuracy_m, WORSE * before.accuracy_m):
-                return f"its estimated position is only accurate to {now.accuracy_m:.1f} m"
         counted = vehicle.measurements - self.measurements
-        measures = self.measured and counted >= MEASUREMENTS_MIN
-        unmeasured_s = vehicle.unmeasured_s
+        measures = self.report and self.measured and counted >= MEASUREMENTS_MIN
         if measures and unmeasured_s > max(limits.gps_s, SLOWEST_S) + MARGIN_S:
             return f"its estimator has used no GPS or external vision for {unmeasured_s:.1f} s"
-        if vehicle.age_s(EstimatorReport) > self.reports_silent_s:
-            return "no report of its estimator"
         return ""
+
+    def invalid(self, vehicle: VehicleState) -> str:
+        """What the reports of the estimator have lost, as a sentence; empty if nothing is."""
+        before, now = self.report, vehicle.estimator
+        if before is None or now is None:
+            return ""
+        if missing := sorted(before.valid - now.valid):
+            return f"its estimator has no valid {', '.join(missing)} any more"
+        if before.accuracy_m is not None and before.valid and now.accuracy_m is None:
+            return "its estimator reports no accuracy of the position any more"
+        silent = vehicle.age_s(EstimatorReport) > self.reports_silent_s
+        return "no report of its estimator" if silent else ""
+
+    def inaccurate(self, vehicle: VehicleState, limits: Limits) -> str:
+        """How inaccurate the position has become, as a sentence; empty if it has not."""
+        before, now = self.report, vehicle.estimator
+        if before is None or now is None or before.accuracy_m is None or now.accuracy_m is None:
+            return ""
+        worse = now.accuracy_m > max(limits.accuracy_m, WORSE * before.accuracy_m)
+        sentence = f"its estimated position is only accurate to {now.accuracy_m:.1f} m"
+        return sentence if before.valid and worse else ""
 
 
 def _silent_s(rate_hz: float) -> float:

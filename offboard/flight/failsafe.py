@@ -24,7 +24,7 @@ FULL_THRUST = 0.99  # normalised
 # Share of the hover thrust at the start: an updraft never, and a lost payload hardly ever, reduces
 # the thrust so far
 LOW_THRUST = 0.5
-STANDS_BELOW_M = 0.25  # below the reference, which is at least 0.3 m above the take-off point
+STANDS_BELOW_M = 0.25  # below the reference, which is at least 0.3 m above the takeoff point
 THRUST_REPORT_S = 1.0  # greatest age of a ThrustReport that counts
 ESTIMATOR_REPORT_S = 0.7  # the same for an EstimatorReport; one alone must not hold for a second
 
@@ -45,11 +45,10 @@ def telemetry_old(flight: FlightState) -> str:
 
 
 def late_link(flight: FlightState) -> str:
-    """Growth of the link delay since take-off (TIMESYNC), or the age of telemetry."""
+    """Growth of the link delay since takeoff (TIMESYNC)."""
     growth_s = flight.clock.delay_growth_s
-    if growth_s > flight.limits.link_growth_s:
-        return f"the delay of the link has grown by {growth_s:.2f} s"
-    return telemetry_old(flight)
+    exceeds = growth_s > flight.limits.link_growth_s
+    return f"the delay of the link has grown by {growth_s:.2f} s" if exceeds else ""
 
 
 def unanswered(flight: FlightState) -> str:
@@ -86,8 +85,7 @@ def away_from_commands(flight: FlightState) -> str:
     """Angle between the thrust direction of the vehicle and the nearest of those of the newest 7
     setpoints, if all 7 are attitude setpoints."""
     vehicle, commands = flight.vehicle, flight.commands
-    # a position setpoint empties `thrusts`, so that it holds only the thrusts sent since then
-    if vehicle.attitude is None or len(flight.thrusts) < COMMANDS_KEPT:
+    if vehicle.attitude is None or len(commands) < COMMANDS_KEPT:
         return ""
     flown = vehicle.thrust_direction_ned
     nearest = max(float(flown @ np.array(each.thrust_direction_ned)) for each in commands)
@@ -135,9 +133,18 @@ def estimate_contradicts(flight: FlightState) -> str:
 
 
 def positioning_lost(flight: FlightState) -> str:
-    """Loss, since take-off, of the GPS fix or external vision, of a valid or accurate position
-    estimate, or of the messages that report them."""
+    """Time without the GPS fix or external vision that the estimator had at takeoff."""
     return flight.positioning.lost(flight.vehicle, flight.limits)
+
+
+def estimate_invalid(flight: FlightState) -> str:
+    """Loss, since takeoff, of a valid position estimate or of its reports."""
+    return flight.positioning.invalid(flight.vehicle)
+
+
+def estimate_inaccurate(flight: FlightState) -> str:
+    """Accuracy of the position by its estimator, if it is twice as bad as at takeoff."""
+    return flight.positioning.inaccurate(flight.vehicle, flight.limits)
 
 
 def measurements_rejected(flight: FlightState) -> str:
@@ -152,7 +159,7 @@ def measurements_rejected(flight: FlightState) -> str:
 
 
 def outside_volume(flight: FlightState) -> str:
-    """Height above the take-off point, and horizontal distance from it."""
+    """Height above the takeoff point, and horizontal distance from it."""
     return flight.outside_volume if flight.plan.reference else ""
 
 
@@ -184,7 +191,7 @@ def sinks_with_full_thrust(flight: FlightState) -> str:
 
 
 def stands_on_ground(flight: FlightState) -> str:
-    """Height of the reference above a vehicle that has stood at its take-off height for 1 s.
+    """Height of the reference above a vehicle that has stood at its takeoff height for 1 s.
 
     Does not apply in the climb, because a weak vehicle may be slow to leave the ground."""
     position, flies = flight.vehicle.position, flight.phase in TRACKING - {Phase.CLIMB}
@@ -273,7 +280,6 @@ class Row:
 
 LEVEL, HOLD, LAND = Action.LEVEL, Action.HOLD, Action.LAND
 MISSED = "{flight.failure_cause}"
-LATE = "limits.link_growth_s, limits.setpoint_age_s"
 UNIDENTIFIED = "BOUNDS of identification"
 ROWS = (
     # after the row "authority" nothing is requested until the mode is known again
@@ -281,7 +287,8 @@ ROWS = (
     Row("silence", silent, "limits.silence_s", LAND, cause="link"),
     Row("blind", blind, f"{Limits.blind_s:g} s", LAND, cause="link"),
     Row("age", telemetry_old, "limits.setpoint_age_s", LEVEL, cause="link"),
-    Row("link", late_link, LATE, HOLD, 0.5, "link"),
+    Row("late", telemetry_old, "limits.setpoint_age_s", HOLD, 0.5, "link"),
+    Row("link", late_link, "limits.link_growth_s", HOLD, 0.5, "link"),
     Row("uplink", unanswered, "limits.silence_s", HOLD, 0.5, "link"),
     Row("decision", decision_missed, "one", LEVEL, cause=MISSED),
     Row("decisions", decisions_missed, "limits.missed_decisions", LAND, cause=MISSED),
@@ -290,9 +297,9 @@ ROWS = (
     Row("position error", away_from_reference, "limits.position_error_m", LAND),
     Row("prediction", away_from_prediction, f"{Limits.prediction_error_m:g} m", HOLD, 0.3),
     Row("estimator", estimate_contradicts, "limits.position_jump_m", HOLD, cause=""),
-    Row(
-        "positioning", positioning_lost, "limits.gps_s, limits.accuracy_m", LAND, 0.5, "positioning"
-    ),
+    Row("positioning", positioning_lost, "limits.gps_s", LAND, 0.5, "positioning"),
+    Row("validity", estimate_invalid, "any", LAND, 0.5, "positioning"),
+    Row("accuracy", estimate_inaccurate, "limits.accuracy_m", LAND, 0.5, "positioning"),
     # vision that repeats a pose flew a real PX4 25 m away, at 7 m/s
     Row("innovations", measurements_rejected, "1", LAND, 1.0, "positioning"),
     Row("volume", outside_volume, "limits.ceiling_m, limits.radius_m", LAND),

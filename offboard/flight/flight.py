@@ -179,7 +179,7 @@ class Flight(FlightState):
     def _go_on_without_telemetry(self) -> None:
         """Do what is due without telemetry: transitions, requests for parameters, and after
         BRIDGED_SHARE of `limits.silence_s` the requests and level setpoints of
-        `actions.act_without_telemetry`, once in each control period of host time."""
+        `actions.act_without_decision`, once in each control period of host time."""
         silence_s, limits, unknown = self.silence_s, self.limits, not self.vehicle.has_state
         silent = silence_s > min(limits.silence_s, limits.connect_s)
         if unknown or self.stop_reason or silent:
@@ -189,7 +189,7 @@ class Flight(FlightState):
         bridges = silence_s > BRIDGED_SHARE * limits.silence_s and not self.in_end_phase
         if bridges and silence_s - self.bridged_s >= self.period_s:
             self.bridged_s = silence_s
-            actions.act_without_telemetry(self, self.time_s + silence_s)
+            actions.act_without_decision(self, self.time_s + silence_s)
         if self.has_ended():
             transitions.name_failsafe(self)
 

@@ -42,7 +42,7 @@ class FlightPlan:
     """The reference in force: none on the ground, the climb after `start_climb`, and the track
     after `start_track`.
 
-    `origin_ned_m` is the point to which the track's positions are relative: the take-off point,
+    `origin_ned_m` is the point to which the track's positions are relative: the takeoff point,
     except for a vehicle that was found in the air (`transitions`).
     """
 

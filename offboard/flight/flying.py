@@ -36,7 +36,7 @@ from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, DISARMED_S
 from offboard.mavlink.events import GOOD_RESULTS, Heartbeat
 
-TAKE_OVER_HEIGHT_M = 1.0  # height at which setpoints replace the autopilot's own take-off
+TAKE_OVER_HEIGHT_M = 1.0  # height at which setpoints replace the autopilot's own takeoff
 DETECTOR_S = 1.0  # time for the land detector to report: EXTENDED_SYS_STATE is requested at 5 Hz
 # Time after the planned end of the climb, when the vehicle is identified though it is not at rest
 RESTLESS_S = 5.0
@@ -105,7 +105,7 @@ def no_lift_off(flight: FlightState) -> str:
     if flight.dialect is None or not flight.takes_off_by_command:
         return f"{after}; is hover_thrust in the vehicle file right?"
     return (
-        f"{after} by the autopilot's own take-off; does full thrust carry the vehicle, and is "
+        f"{after} by the autopilot's own takeoff; does full thrust carry the vehicle, and is "
         f"{flight.dialect.hover_parameter} right?"
     )
 
@@ -173,8 +173,7 @@ def failsafe_hold(flight: FlightState) -> bool:
 
 def hold_refused(flight: FlightState) -> str:
     """The autopilot cannot hold: PX4 without a global position, as by motion capture, does not."""
-    assert flight.dialect is not None
-    hold = flight.dialect.set_mode(flight.holds_in)
+    hold = flight.known_dialect.set_mode(flight.holds_in)
     result = flight.vehicle.results.get(hold.command, "ACCEPTED")
     if hold not in flight.requested_s or result in GOOD_RESULTS:
         return ""
@@ -186,8 +185,8 @@ def refused_to_pilot(flight: FlightState) -> str:
     mode in which he did."""
     refused, before = hold_refused(flight), flight.authority.engaged_from
     flown = flight.outcome is None or flight.outcome.exit_code != REFUSED
-    assert flight.dialect is not None
-    if not refused or flown or before not in flight.dialect.assisted_modes or flight.returns_to:
+    assisted = flight.known_dialect.assisted_modes
+    if not refused or flown or before not in assisted or flight.returns_to:
         return ""
     return f"{refused}: back to {before}"
 
@@ -220,7 +219,7 @@ def out_of_reach(flight: FlightState) -> str:
     return (
         f"not heard for {flight.unreached_s:.0f} s while landing; last known: "
         f"{'armed' if vehicle.armed else 'disarmed'} in {vehicle.mode}, "
-        f"{height_m:.1f} m above the take-off point"
+        f"{height_m:.1f} m above the takeoff point"
     )
 
 

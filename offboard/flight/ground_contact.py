@@ -33,7 +33,7 @@ REST_S = 0.5  # the vehicle is at rest if its height stays for this time
 REST_M = 0.15  # within this range; a single estimated speed is too noisy
 BEFORE_S = 1.0  # time before the rest in which the greatest speed is taken: a fall of 5 m
 BOUNCE_M = 0.3  # a greater change of the height ends the rest
-ABOVE_TAKEOFF_M = 1.5  # a landing may be higher than the take-off: drift of the estimate
+ABOVE_TAKEOFF_M = 1.5  # a landing may be higher than the takeoff: drift of the estimate
 SLOPE = 0.1  # and, by this share of the distance, slope of the terrain
 
 
@@ -141,7 +141,7 @@ class Touchdown:
     """One landing. Give it each position from the beginning of the landing on, without the jumps of
     the estimate (`estimates.PositionJumps`).
 
-    `takeoff_ned_m` is the take-off point. If it is None, the height is not judged. `speed_mps` is
+    `takeoff_ned_m` is the takeoff point. If it is None, the height is not judged. `speed_mps` is
     the greatest downward speed in the second before the vehicle came to rest where it is; NaN
     before it has come to rest. A bounce of up to BOUNCE_M does not end the rest.
     """
@@ -190,4 +190,4 @@ class Touchdown:
             return ""
         height_m = takeoff_ned_m[2] - position_ned_m[2]
         limit_m = ABOVE_TAKEOFF_M + SLOPE * math.dist(takeoff_ned_m[:2], position_ned_m[:2])
-        return f"{height_m:.1f} m above the take-off point" if height_m > limit_m else ""
+        return f"{height_m:.1f} m above the takeoff point" if height_m > limit_m else ""

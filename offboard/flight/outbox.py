@@ -205,7 +205,8 @@ def _send_position(flight: FlightState, time_s: float, command: PositionCommand)
     """Send a position setpoint. The attitude that the autopilot's position loop commands is not
     known, so the observer stops predicting with commands."""
     flight.observer.freeze(True)
-    flight.thrusts.clear()  # the autopilot chooses the thrust
+    flight.commands.clear()  # the autopilot chooses attitude and thrust
+    flight.thrusts.clear()
     flight.command = Command(flight.model.gravity_mps2, LEVEL_DIRECTION, command.heading_rad)
     flight.newest_setpoint = PositionTarget(time_s, command)
     send(flight, flight.newest_setpoint)

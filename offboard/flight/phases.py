@@ -31,7 +31,7 @@ class Phase(Enum):
     STREAM = "stream", 2  # sends setpoints, which PX4 requires before OFFBOARD
     ENGAGE = "engage", 3  # requests the mode of setpoints: OFFBOARD or GUIDED
     ARM = "arm", 4  # requests arming
-    TAKEOFF = "takeoff", 5  # increases the thrust, or requests the autopilot's own take-off
+    TAKEOFF = "takeoff", 5  # increases the thrust, or requests the autopilot's own takeoff
     CLIMB = "climb", 6  # flies to the start of the reference
     EXCITE = "excite", 14  # flies small steps there, to identify the vehicle
     JOIN = "join", 7  # flies the run-in of the reference
@@ -108,7 +108,7 @@ Then = Literal["hold", "land", "repeat"]
 @dataclass(frozen=True, slots=True)
 class ServiceOptions:
     """How the service flies. `anchor`: where it places the reference of a flight that begins in the
-    air: with its start where the vehicle stops (here), or relative to the take-off point (origin).
+    air: with its start where the vehicle stops (here), or relative to the takeoff point (origin).
     `then`: what it does at the end of the reference. `arms`: whether it may arm and take off on
     request."""
 
@@ -149,7 +149,7 @@ class Limits(Parameters):
     land_s: float = Field(default=90.0, gt=0, le=600)
     silence_s: float = Field(default=1.0, ge=0.2, le=60)  # no telemetry
     setpoint_age_s: float = Field(default=0.25, ge=0.1, le=2)  # of telemetry beyond link delay
-    link_growth_s: float = Field(default=0.3, gt=0, le=2)  # of the link delay since take-off
+    link_growth_s: float = Field(default=0.3, gt=0, le=2)  # of the link delay since takeoff
     missed_decisions: int = Field(default=3, ge=1, le=100)  # in a row
     position_error_m: float = Field(default=5.0, ge=0.1, le=100)
     gps_s: float = Field(default=1.0, ge=0.5, le=600)  # without the GPS fix or vision it had
@@ -158,8 +158,8 @@ class Limits(Parameters):
     hover_thrust: float = Field(default=0.9, ge=0.05, le=1)  # normalised thrust that hovers
     tilt_rad: float = Field(default=1.3, ge=0.2, le=1.5)
     tilt_error_rad: float = Field(default=0.5, ge=0.1, le=3.2)  # from every recent command
-    ceiling_m: float = Field(default=120.0, gt=0, le=10000)  # above the take-off point
-    radius_m: float = Field(default=1000.0, gt=0, le=100000)  # from the take-off point
+    ceiling_m: float = Field(default=120.0, gt=0, le=10000)  # above the takeoff point
+    radius_m: float = Field(default=1000.0, gt=0, le=100000)  # from the takeoff point
     # remaining charge, 0 .. 1; with 1 the vehicle would land at once
     battery: float = Field(default=0.1, ge=0, le=0.9)
     log_lost: Literal["land", "go_on"] = "land"  # if the log cannot be written

@@ -106,13 +106,19 @@ class Ground:
         return self.session.dialect
 
     @property
+    def known_dialect(self) -> Dialect:
+        """The dialect of the vehicle, which must have been found."""
+        assert self.session.dialect is not None
+        return self.session.dialect
+
+    @property
     def in_the_air(self) -> bool:
         """Whether the vehicle may be in the air; True in doubt."""
         return self.vehicle.armed
 
     @property
     def origin_missing(self) -> bool:
-        """Whether the reference is relative to a take-off point that is not known."""
+        """Whether the reference is relative to a takeoff point that is not known."""
         return False
 
     @property
@@ -123,7 +129,8 @@ class Ground:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One condition: `problem` returns what is wrong, empty if nothing is; `fix` says what to do.
+    """One condition: `problem` returns what is wrong, empty if nothing is; `fix` says what to do, a
+    text with values of the ground in braces.
 
     `at_once`: whether `fly` refuses without waiting `limits.health_s` for the problem to clear.
     `fly_only`: whether `daemon`, which waits for its pilot, leaves the condition out."""
@@ -137,17 +144,21 @@ class Row:
 
 
 def findings(ground: Ground) -> Iterator[tuple[str, bool, Finding]]:
-    """Yield what is wrong, in the order of the list, and then what is wrong with the autopilot's
+    """Yield what is wrong with a vehicle that was found, in the order of the list, then with its
     parameters. Each item has the name of the check, whether `fly` refuses the vehicle at once, and
-    the finding."""
+    the finding. For a vehicle of an unfit type all other rows and the parameters mean something
+    else."""
+    if unfit := unfit_type(ground):
+        yield "vehicle", True, Finding(Level.BLOCKS, unfit, _UNFIT)
+        return
     for row in PREFLIGHT:
         found = "" if row.fly_only and ground.service else row.problem(ground)
         if found:
             level = row.level if isinstance(row.level, Level) else row.level(ground)
-            fix = row.fix if isinstance(row.fix, str) else row.fix(ground)
+            fix = row.fix
+            fix = fix.format(ground=ground) if isinstance(fix, str) else fix(ground)
             yield row.check, row.at_once, Finding(level, found, fix)
-    dialect = None if unfit_type(ground) else ground.dialect  # a rover's GUID_OPTIONS are others
-    for parameter in dialect.watched_parameters if dialect else ():
+    for parameter in ground.known_dialect.watched_parameters:
         name, value = parameter.name, ground.vehicle.parameters.get(parameter.name)
         fault = None if value is None else parameter.fault(value)
         if fault:
@@ -181,7 +192,7 @@ def only_mode_is_unfit(ground: Ground) -> bool:
 def unfit_type(ground: Ground) -> str:
     """Why a vehicle of this MAV_TYPE, whose modes are not known here, is not flown; else empty."""
     heartbeat = ground.vehicle.heartbeat
-    if heartbeat is None or ground.dialect is None:
+    if heartbeat is None:
         return ""
     helicopter = ground.model.airframe == "helicopter"
     return senders.unfit_type(heartbeat.vehicle_type, helicopter=helicopter)
@@ -194,8 +205,8 @@ def armed_already(ground: Ground) -> str:
 
 
 def _flown_by_another(ground: Ground) -> str:
-    vehicle, dialect = ground.vehicle, ground.dialect
-    engaged = vehicle.armed and dialect is not None and vehicle.mode == dialect.engage_mode
+    vehicle = ground.vehicle
+    engaged = vehicle.armed and vehicle.mode == ground.known_dialect.engage_mode
     if not engaged or ground.limits.begin_engaged:
         return ""
     return (
@@ -249,7 +260,7 @@ def other_vehicle(ground: Ground) -> str:
 
 
 def _no_telemetry(ground: Ground) -> str:
-    vehicle, dialect = ground.vehicle, ground.dialect
+    vehicle = ground.vehicle
     newest = {"LOCAL_POSITION_NED": vehicle.position, "ATTITUDE_QUATERNION": vehicle.attitude}
     missing = [name for name, value in newest.items() if value is None]
     if vehicle.heartbeat is not None and vehicle.age_s(Heartbeat) > ARMED_KNOWN_S:
@@ -258,7 +269,7 @@ def _no_telemetry(ground: Ground) -> str:
         return ""
     silent = "HEARTBEAT" in missing  # then earlier reports explain nothing
     problem = vehicle.estimator.problem if vehicle.estimator and not silent else ""
-    why = (problem and f": {problem}") + vehicle.explanation(dialect.unsaid if dialect else "")
+    why = (problem and f": {problem}") + vehicle.explanation(ground.known_dialect.unsaid)
     return f"no {' and no '.join(missing)} arrives{why}"
 
 
@@ -287,59 +298,55 @@ def _landed_unknown(ground: Ground) -> str:
 
 
 def _reading(ground: Ground) -> str:
-    read = ground.dialect is not None and ground.reading.complete(ground.dialect, ground.vehicle)
+    read = ground.reading.complete(ground.known_dialect, ground.vehicle)
     return "" if read else "its parameters are still being read"
 
 
 def _origin(ground: Ground) -> str:
-    unseen = "its take-off point is not known, as it was not seen on the ground (--anchor origin)"
+    unseen = "its takeoff point is not known, as it was not seen on the ground (--anchor origin)"
     return unseen if ground.origin_missing else ""
 
 
 def _prearm(ground: Ground) -> str:
-    vehicle, dialect = ground.vehicle, ground.dialect
-    if vehicle.prearm_ok or vehicle.armed or dialect is None:
+    vehicle = ground.vehicle
+    if vehicle.prearm_ok or vehicle.armed:
         return ""
     if vehicle.health is None:
         return "SYS_STATUS does not arrive: it is unknown whether the vehicle can arm"
     if _needs_setpoints(ground):
         return ""
-    unsaid = f"{vehicle.unhealthy()} ({dialect.unsaid})"
+    unsaid = f"{vehicle.unhealthy()} ({ground.known_dialect.unsaid})"
     told = vehicle.explanation(unsaid) if vehicle.texts else unsaid
     return f"its pre-arm checks do not pass in {vehicle.mode}{told}"
 
 
 def _needs_setpoints(ground: Ground) -> str:
     """PX4 in OFFBOARD refuses to arm while no setpoints arrive, whatever the vehicle's state."""
-    vehicle, dialect = ground.vehicle, ground.dialect
-    if dialect is None or dialect.takes_off_by_command or vehicle.health is None:
+    vehicle, dialect = ground.vehicle, ground.known_dialect
+    if dialect.takes_off_by_command or vehicle.health is None:
         return ""
     if vehicle.mode != dialect.engage_mode or vehicle.prearm_ok or vehicle.armed:
         return ""
     return f"its pre-arm checks pass in {vehicle.mode} only while setpoints arrive"
 
 
-def _other_mode(ground: Ground) -> str:
-    mode = ground.dialect.hold_mode if ground.dialect else ""
-    return f"select {mode}, as `offboard fly` does first"
-
-
 def _remedy(ground: Ground) -> str:
-    return ground.dialect.remedy(ground.vehicle.texts) if ground.dialect else ""
+    return ground.known_dialect.remedy(ground.vehicle.texts)
 
 
 def _without_gps(ground: Ground) -> bool:
     """Whether a PX4 has a valid estimate without GPS."""
-    px4 = ground.dialect is not None and not ground.dialect.takes_off_by_command
+    px4 = not ground.known_dialect.takes_off_by_command
     return px4 and ground.vehicle.without_gps and not _no_estimate(ground)
 
 
 def _prearm_fix(ground: Ground) -> str:
-    if ground.dialect is None or not _without_gps(ground):
+    dialect = ground.known_dialect
+    if not _without_gps(ground):
         return _remedy(ground)
     return (
-        f"`offboard fly` also tries {ground.dialect.engage_mode}, which needs no global position; "
-        f"it lands the vehicle if {ground.dialect.hold_mode} is refused in flight"
+        f"`offboard fly` also tries {dialect.engage_mode}, which needs no global position; it "
+        f"lands the vehicle if {dialect.hold_mode} is refused in flight"
     )
 
 
@@ -360,7 +367,7 @@ def _estimate_level(ground: Ground) -> Level:
 
 def _outside_volume(ground: Ground) -> str:
     limits, where = ground.limits, ground.outside_volume
-    if not (where and ground.in_the_air):  # a vehicle on the ground is at its take-off point
+    if not (where and ground.in_the_air):  # a vehicle on the ground is at its takeoff point
         return ""
     named = f"limits.ceiling_m is {limits.ceiling_m:g}, limits.radius_m is {limits.radius_m:g}"
     return f"{where} ({named})"
@@ -407,18 +414,14 @@ _UNFIT = (
     "with its own autopilot"
 )
 _FAILSAFE = "let the pilot take over first"
+_OTHER_MODE = "select {ground.known_dialect.hold_mode}, as `offboard fly` does first"
 _CHOOSE = "choose one with --system, or give each vehicle its own port"
 _SAME_ID = "switch one off, or change its system id"
 _ONE_WAY = f"{_SAME_ID}; send the telemetry of one vehicle over one link only"
 
 
-def _slow_hint(ground: Ground) -> str:
-    return ground.dialect.slow_hint if ground.dialect else ""
-
-
 WARN, WAIT, BLOCKS = Level.WARN, Level.WAIT, Level.BLOCKS
 PREFLIGHT = (
-    Row("vehicle", BLOCKS, unfit_type, _UNFIT, at_once=True),
     Row("state", BLOCKS, _flown_by_another, "stop that controller", at_once=True, fly_only=True),
     Row("state", BLOCKS, _flown_by_failsafe, _FAILSAFE, at_once=True, fly_only=True),
     Row("state", BLOCKS, armed_already, "disarm it", at_once=True, fly_only=True),
@@ -428,13 +431,13 @@ PREFLIGHT = (
     Row("senders", BLOCKS, twin, _ONE_WAY),
     Row("rates", WAIT, _no_telemetry, _remedy),
     Row("supervisor", WAIT, _unguarded),
-    Row("rates", BLOCKS, _slow, _slow_hint),
+    Row("rates", BLOCKS, _slow, "{ground.known_dialect.slow_hint}"),
     Row("state", BLOCKS, _landed_unknown),
     Row("parameters", WAIT, _reading),
     Row("origin", WAIT, _origin),
     Row("estimator", _estimate_level, _no_estimate, _ESTIMATOR),
     Row("prearm", WAIT, _prearm, _prearm_fix, fly_only=True),
-    Row("prearm", WARN, _needs_setpoints, _other_mode, fly_only=True),
+    Row("prearm", WARN, _needs_setpoints, _OTHER_MODE, fly_only=True),
     Row("battery", BLOCKS, _empty_battery, "charge the battery"),
     Row("volume", BLOCKS, _outside_volume, "fly nearer to that point, or raise the limits"),
     Row("delay", WAIT, _measuring),

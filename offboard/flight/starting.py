@@ -248,7 +248,7 @@ TOO_SOON = (
     "not engaged: {flight.vehicle.mode} again before a HEARTBEAT has shown another mode, or while "
     "a flight ended; switch again"
 )
-BEFORE_TAKEOFF = "{flight.stop_reason} before take-off"
+BEFORE_TAKEOFF = "{flight.stop_reason} before takeoff"
 DISARMED_AGAIN = "the vehicle was disarmed just after it had armed"
 FLIGHT_DETECTED = "flight was detected while it was asked to disarm"
 LOST_AS_IT_ARMED = "{flight.authority.lost_reason} as it armed"

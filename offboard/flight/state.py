@@ -96,7 +96,7 @@ class FlightState(Ground):
     failsafe: Failsafe = field(default_factory=Failsafe)
     contact: GroundContact = field(init=False)
     pilot: PilotSwitch = PilotSwitch.FOUND
-    # take-off point, or for a vehicle that was found in the air the place where it last rested (if
+    # takeoff point, or for a vehicle that was found in the air the place where it last rested (if
     # unknown, the point below it); a place as in `PositionJumps`, without jumps of the estimate
     home_ned_m: Triple = (0.0, 0.0, 0.0)
     took_off: bool = False  # in this flight; a vehicle that was found in the air did not
@@ -133,6 +133,7 @@ class FlightState(Ground):
     missed_decisions: int = 0  # in a row that were not sent
     failure: str = ""  # what prevented the newest of them
     failure_cause: str = ""  # in a word: controller, link or computer
+    # attitude setpoints, and their thrusts, since the newest position setpoint
     commands: deque[Command] = field(default_factory=lambda: deque(maxlen=COMMANDS_KEPT))
     thrusts: deque[float] = field(default_factory=lambda: deque(maxlen=THRUSTS_KEPT))
     announced: list[str] = field(default_factory=list)  # newest sentences, oldest first
@@ -194,8 +195,7 @@ class FlightState(Ground):
     @property
     def holds_in(self) -> str:
         """The mode in which the vehicle is held or handed back."""
-        assert self.dialect is not None
-        return self.returns_to or self.dialect.hold_mode
+        return self.returns_to or self.known_dialect.hold_mode
 
     @property
     def in_the_air(self) -> bool:
@@ -212,7 +212,7 @@ class FlightState(Ground):
         distance_m = math.hypot(north_m, east_m)
         if not (height_m > self.limits.ceiling_m or distance_m > self.limits.radius_m):
             return ""
-        return f"{height_m:.0f} m above and {distance_m:.0f} m from the take-off point"
+        return f"{height_m:.0f} m above and {distance_m:.0f} m from the takeoff point"
 
     @property
     def in_phase_s(self) -> float:
@@ -245,7 +245,7 @@ class FlightState(Ground):
 
     @property
     def from_takeoff_m(self) -> Triple:
-        """North, east and height of the newest position relative to the take-off point; without a
+        """North, east and height of the newest position relative to the takeoff point; without a
         reference relative to the last rest."""
         position = self.vehicle.position
         if position is None:
@@ -337,7 +337,7 @@ class FlightState(Ground):
 
     def delays_begin_s(self, time_s: float) -> float:
         """Return the vehicle time from which the delays of the vehicle model count for a command of
-        the tick `time_s`. It is later than `time_s` by the growth of the link delay since take-off.
+        the tick `time_s`. It is later than `time_s` by the growth of the link delay since takeoff.
         """
         return time_s + self.clock.growth.added_s
 

@@ -186,8 +186,7 @@ def _follow_jump(flight: FlightState, event: LocalPosition) -> None:
 def _on_mode(
     flight: FlightState, event: Heartbeat | ModeReport, mode: str, arrived_s: float
 ) -> None:
-    dialect = flight.dialect
-    assert dialect is not None
+    dialect = flight.known_dialect
     boots = isinstance(event, Heartbeat) and event.system_status == BOOTS
     if boots and not flight.rebooted and flight.phase in FLYING | {Phase.LAND}:
         _on_reboot(flight)  # first, or the mode that it shows would count as a pilot's choice

@@ -198,7 +198,7 @@ class VehicleClock:
 
 
 class LinkGrowth:
-    """Growth of the link delay since take-off, for the prediction and the bandwidth.
+    """Growth of the link delay since takeoff, for the prediction and the bandwidth.
 
     `added_s` is the growth; it follows changes of more than LEAST_GROWTH_S. `changed_s` is the
     range of `added_s` in the last STEADY_S: a delay that changes is not known better than that.

@@ -182,10 +182,8 @@ def _begin_to_fly(flight: FlightState, source: Phase) -> None:
     """Note what is known about vehicle and link when the first phase in flight begins."""
     flight.authority.ask()  # it may show the mode already
     flight.clock.settle()
-    dialect = flight.dialect
-    assert dialect is not None
     rates_hz = flight.session.telemetry.rates_hz
-    flight.positioning.begin(flight.vehicle, rates_hz, dialect.estimator_message)
+    flight.positioning.begin(flight.vehicle, rates_hz, flight.known_dialect.estimator_message)
     if flight.identification:
         flight.identification.on_link_delay(flight.clock.delay)
         if limits := shown_limits(flight, flight.identification):
@@ -240,7 +238,7 @@ def _begin_land(flight: FlightState, source: Phase) -> None:
 
 
 def _begin_climb(flight: FlightState, source: Phase) -> None:
-    """Plan the climb to the start of the reference: after take-off, after the pilot has engaged in
+    """Plan the climb to the start of the reference: after takeoff, after the pilot has engaged in
     the air, or for one more flight of the reference."""
     position = flight.vehicle.position
     assert position is not None

@@ -91,7 +91,7 @@ class VehicleEstimate:
         self._delay_sd_s, self._thrust_sd_s = known.delay_sd_s, known.thrust_sd_s
         self._drag_sd_ps = math.inf
         self._link_s = known.link_s  # link delay that `vehicle` contains
-        self._link = (0.0, 0.0)  # increase of the link delay since take-off, and recent change
+        self._link = (0.0, 0.0)  # increase of the link delay since takeoff, and recent change
         self._doubt_s = 0.0  # uncertainty of the delay because telemetry contradicts it
         self._contradictions = 0
         self._calm_from_s = -math.inf  # the time of the last contradiction
@@ -183,7 +183,7 @@ class VehicleEstimate:
         )
 
     def on_link_growth(self, added_s: float, changed_s: float) -> None:
-        """Use the growth `added_s` of the link delay since take-off, which the times of commands
+        """Use the growth `added_s` of the link delay since takeoff, which the times of commands
         contain, and its recent change `changed_s`, by which the delay is uncertain at least."""
         link = round(added_s, LINK_DIGITS), round(changed_s, LINK_DIGITS)
         if self._link == link:
@@ -191,7 +191,7 @@ class VehicleEstimate:
         self._link = link
         grown_ms, lately_ms = (round(1e3 * each) for each in link)
         of_link = (
-            f"has changed by {lately_ms} ms lately" if lately_ms else "is the same as at take-off"
+            f"has changed by {lately_ms} ms lately" if lately_ms else "is the same as at takeoff"
         )
         if grown_ms > 0:
             of_link = f"has grown by {grown_ms} ms"

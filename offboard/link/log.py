@@ -12,7 +12,7 @@ import os
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from errno import EACCES, EEXIST, ENOTDIR
+from errno import EACCES, EEXIST, ENOENT, ENOTDIR
 from pathlib import Path
 from typing import BinaryIO
 
@@ -108,7 +108,10 @@ class FlightLog:
         self._closed = True
         self._writer.close(CLOSE_S)
         if self._writer.is_free() and self.descriptor >= 0:  # not while the thread still writes
-            os.close(self.descriptor)
+            try:
+                os.close(self.descriptor)
+            except OSError as error:  # NFS and quotas report only now what could not be written
+                self._writer.error = error
 
     @property
     def problem(self) -> str:
@@ -139,6 +142,8 @@ class FlightLog:
         if self.descriptor < 0:
             self._open()
         append(self.descriptor, entries)
+        if not os.fstat(self.descriptor).st_nlink:
+            raise FileNotFoundError(ENOENT, "it was deleted")
 
 
 def entry(unix_us: int, frame: bytes) -> bytes:

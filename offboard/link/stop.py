@@ -1,7 +1,7 @@
 """Stop requests: a signal from a terminal or a service manager sets a flag.
 
 A KeyboardInterrupt during a compilation can be lost in a callback of the compiler, and the flight
-would begin. Therefore the first signal only sets a flag, which is checked at known places.
+would begin. Therefore a signal sets a flag, which is checked at known places.
 """
 
 from __future__ import annotations
@@ -15,21 +15,16 @@ from offboard.link import clock
 AGAIN_S = 1.0  # signals within this time are one request: `timeout` signals child and group
 
 
-def interrupt() -> None:
-    """Raise KeyboardInterrupt."""
-    raise KeyboardInterrupt
-
-
 class StopRequests:
     """Context manager that handles SIGINT, SIGTERM and, unless it is ignored (nohup), SIGHUP.
 
-    The first signal is a stop request. A second one, a second or more later, ends the program at
-    once: before the flight by calling `at_once`, in flight by `repeated`, which the loop checks. A
-    third one raises KeyboardInterrupt in a loop that hangs. SIGHUP counts only as the first,
-    because a closing terminal may send it twice.
+    The first signal is a stop request; before the flight it also calls `at_once`. A second one, a
+    second or more later, ends the program: before the flight by KeyboardInterrupt, in flight by
+    `repeated`, which the loop checks. A third one raises KeyboardInterrupt in a loop that hangs.
+    SIGHUP counts only as the first, because a closing terminal may send it twice.
     """
 
-    def __init__(self, at_once: Callable[[], None] = interrupt) -> None:
+    def __init__(self, at_once: Callable[[], None] = lambda: None) -> None:
         self._at_once = at_once
         self._first_s: float | None = None
         self.repeated = False
@@ -60,9 +55,9 @@ class StopRequests:
         now_s = clock.monotonic_s()
         if self._first_s is None:
             self._first_s = now_s
+            if not self.in_flight:
+                self._at_once()
         elif number != signal.SIGHUP and now_s - self._first_s >= AGAIN_S:
-            if self.repeated and self.interruptible:
-                interrupt()
+            if not self.in_flight or (self.repeated and self.interruptible):
+                raise KeyboardInterrupt
             self.repeated = True
-        if self.repeated and not self.in_flight:
-            self._at_once()

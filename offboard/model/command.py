@@ -23,7 +23,8 @@ class PredictedVertical:
 
 @dataclass(frozen=True, slots=True)
 class PredictedState:
-    """The state predicted by the observer for `time_s`, when a command sent now takes effect.
+    """The state predicted by the observer for `time_s`, when a command sent now takes effect. Its
+    arrays cannot be changed, because the failsafe compares them with the motion that follows.
 
     Acceleration = g e3 - T b - c v + d, with thrust T, direction b, drag c and disturbance d.
 
@@ -54,6 +55,11 @@ class PredictedState:
     disturbance_ned_mps2: Array
     rates_frd_radps: Array
     vertical: PredictedVertical | None = None
+
+    def __post_init__(self) -> None:
+        for value in map(self.__getattribute__, self.__slots__):
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
 
 
 @dataclass(frozen=True, slots=True)

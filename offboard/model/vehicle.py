@@ -119,7 +119,7 @@ class DelayUncertainty:
     """Uncertainty of a vehicle's delays, s.
 
     `tilt_s` and `thrust_s` are the largest expected errors of the delays, three standard deviations
-    of an identified one. `link_s` is the increase of the link delay since take-off; it is known
+    of an identified one. `link_s` is the increase of the link delay since takeoff; it is known
     and compensated by prediction.
     """
 

@@ -25,7 +25,7 @@ _CHUNK = 20_000
 
 
 class Envelope(NamedTuple):
-    """The greatest tilt, height above, and horizontal distance from the take-off point."""
+    """The greatest tilt, height above, and horizontal distance from the takeoff point."""
 
     tilt_rad: float
     height_m: float
@@ -48,13 +48,14 @@ def check(reference: Reference, vehicle: Vehicle, slower: str = "") -> Envelope:
     """Check that a vehicle can fly a reference without wind, and return its envelope. `slower` says
     how the reference becomes slower; it ends the error for a limit of the vehicle.
 
-    The reference, relative to the take-off point, is sampled every 10 ms. Raises ValueError for a
+    The reference, relative to the takeoff point, is sampled every 10 ms. Raises ValueError for a
     path that is too low or too far away, otherwise for the limit that is exceeded first. Times in
     the error are those of the path if the reference is a `Track`, as in the rows of a table.
     """
     count = int(np.ceil(reference.duration_s / _STEP_S)) + 1
     times = np.linspace(0.0, reference.duration_s, count)
-    parts = [times[first : first + _CHUNK] for first in range(0, count, _CHUNK)]
+    # a part ends with the first sample of the next one, so that no step between two is left out
+    parts = [times[first : first + _CHUNK + 1] for first in range(0, count, _CHUNK)]
     reached = np.max([_envelope(reference, vehicle, slower, part) for part in parts], axis=0)
     return Envelope(*reached.tolist())
 

@@ -1,7 +1,7 @@
 """The shapes of references: one class per shape, with its settings and its path.
 
 A reference file (`config/references/*.yaml`) holds the settings of one shape, named by `shape`.
-Heights are metres above the take-off point, positive up; other coordinates are metres north and
+Heights are metres above the takeoff point, positive up; other coordinates are metres north and
 east of it. A new shape is a class here, a row in `SHAPES` and a file. This module reads no file.
 """
 
@@ -51,7 +51,7 @@ ROUNDED, ROUNDED_KNOTS_S = 0.03, 0.5
 
 
 class Shape(Parameters, ABC):
-    """Settings of every shape. Its origin is `height_m` above the take-off point, and
+    """Settings of every shape. Its origin is `height_m` above the takeoff point, and
     `origin_north_m` and `origin_east_m` from it; `course_deg` is the fixed heading, clockwise from
     north. The vehicle accelerates during `run_in_s` and brakes during `run_out_s`; see `Track`.
     """
@@ -75,7 +75,7 @@ class Shape(Parameters, ABC):
         """
 
     def track(self) -> Track:
-        """Return the reference, NED relative to the take-off point. Raises ValueError like `path`,
+        """Return the reference, NED relative to the takeoff point. Raises ValueError like `path`,
         and if the runs do not fit (`Track.check_runs`)."""
         path, fixed_rad = self.path(), math.radians(self.course_deg)
         origin_ned_m = (self.origin_north_m, self.origin_east_m, -float(self.height_m))
@@ -255,7 +255,7 @@ class Waypoints(Shape):
 
 
 class FromTable(Shape):
-    """A CSV table (see `table`). Positions and heights are relative to the take-off point.
+    """A CSV table (see `table`). Positions and heights are relative to the takeoff point.
 
     `course: table` uses the column course_deg, or the fixed `course_deg` if the table has no such
     column. `knot_spacing_s` > 0 smooths noisy rows, 0 passes through every row. Without it, dense

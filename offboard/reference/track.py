@@ -90,7 +90,7 @@ class Track:
     """A `Reference` from rest to rest, continuous to snap in position and to acceleration in
     heading (at an end without run-in or run-out, as continuous as the path is there).
 
-    Time 0 is the start of the run-in; positions are NED relative to the take-off point. `heading`
+    Time 0 is the start of the run-in; positions are NED relative to the takeoff point. `heading`
     is constant, rad, or along the velocity. A fourth column of the path replaces a constant one.
     """
 
@@ -186,7 +186,7 @@ class Moved:
     Args:
         reference: the reference in its own time and frame.
         start_s: its time 0 on the new axis, such as vehicle time.
-        origin_ned_m: its origin in the new frame, such as the take-off point.
+        origin_ned_m: its origin in the new frame, such as the takeoff point.
         paused_s: time on the new axis at which the stop begins.
         resumed_s: time on the new axis at which the start begins, at the earliest when at rest.
     """

@@ -1,4 +1,4 @@
-"""Flights from a start, at rest or moving, to rest at a target: used for the climb after take-off
+"""Flights from a start, at rest or moving, to rest at a target: used for the climb after takeoff
 and for the way back after a jump of the estimate.
 """
 

@@ -56,7 +56,7 @@ class Flight:
 
     @property
     def track_s(self) -> float:
-        """Vehicle time at which TRACK first began; without it that of the take-off, or else of the
+        """Vehicle time at which TRACK first began; without it that of the takeoff, or else of the
         first sample."""
         begun = begin_times(self.history.phases[::-1])
         return begun.get("track", begun.get("takeoff", self.begin_s))
@@ -86,9 +86,9 @@ def read(path: Path) -> Flight:
             missing.append(f"no {what}: neither {usual} nor {substitute}")
         elif substitute in flown.substitutes:
             missing.append(f"no {usual}: the {what} is that of {substitute}{how}")
-    if flown.damage:
-        at = "" if math.isnan(flown.damage_s) else f", at {flown.damage_s:.2f} s of vehicle time"
-        missing.append(f"{flown.damage}{at}")
+    if flown.unread:
+        at = "" if math.isnan(flown.damaged_s) else f", at {flown.damaged_s:.2f} s of vehicle time"
+        missing.append(f"{flown.unread}{at}")
     if log.truncated:
         missing.append(
             f"the log ends within an entry, at byte {log.path.stat().st_size - log.truncated}"

@@ -25,7 +25,7 @@ from offboard.documents import shipped
 from offboard.documents.errors import DocumentError, outside, wrong_result
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, read, validate
-from offboard.documents.shipped import PARTS, locate, read_text
+from offboard.documents.shipped import PARTS, beside, locate, read_text
 from offboard.flight.phases import Limits
 from offboard.identification.learner import IdentifySettings
 from offboard.model.vehicle import Vehicle
@@ -79,7 +79,7 @@ def load(
     if known_vehicle and raw.get("vehicle") == UNKNOWN_VEHICLE:
         raw["vehicle"] = known_vehicle
     for part in PARTS:
-        chosen = (choices or {}).get(part) or raw.get(part)
+        chosen = (choices or {}).get(part) or _placed(raw.get(part), path)
         if isinstance(chosen, str):
             raw[part] = read_part(part, chosen)
     for assignment in assignments:
@@ -138,7 +138,7 @@ def build_track(config: FlightConfig) -> Track:
         if reached_m > limit_m:  # the failsafe would end the flight there
             raise DocumentError(
                 f"reference {config.reference.title}: it goes {reached_m:.4g} m {where} the "
-                f"take-off point, beyond {limit} ({limit_m:g} m); fly nearer or raise the limit"
+                f"takeoff point, beyond {limit} ({limit_m:g} m); fly nearer or raise the limit"
             )
     with outside("controller"):
         refused = config.controller.refusal(track)
@@ -214,8 +214,8 @@ def _missing(part: str, raw: Raw) -> str:
 
 
 def read_part(part: str, name: str) -> Raw:
-    """Read and validate a vehicle, controller or reference by shipped name or file. The path of a
-    reference's table is relative to the file that names it. Raises DocumentError."""
+    """Read and validate a vehicle, controller or reference by shipped name or file. Raises
+    DocumentError."""
     if part == "reference" and name.lower().endswith(".csv"):
         return {"shape": "table", "file": name}
     laws = []
@@ -227,9 +227,18 @@ def read_part(part: str, name: str) -> Raw:
     raw = read(read_text(path), str(path), part)
     with outside(str(path)):
         validate(raw, _model(part, raw, str(path)), str(path))
-    if raw.get("shape") == "table":
-        raw["file"] = str(path.parent / raw["file"])
-    return raw
+    placed: Raw = _placed(raw, path)
+    return placed
+
+
+def _placed(part: Any, path: Path) -> Any:
+    """A part of a configuration, or its name, as the file `path` gives it. The path of its file, or
+    of a reference's table, is relative to `path`."""
+    if isinstance(part, str):
+        return beside(part, path)
+    if isinstance(part, dict) and isinstance(part.get("file"), str) and "text" not in part:
+        part["file"] = str(path.parent / part["file"])
+    return part
 
 
 def _model(part: str, raw: object, source: str) -> type[BaseModel]:

@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import ExitStack
-from copy import deepcopy
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -29,6 +28,7 @@ from offboard.flight.record import configuration_pieces
 from offboard.identification.learner import Learner
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link import clock
+from offboard.link.background import within
 from offboard.link.connection import open_link, open_lockstep_link
 from offboard.link.interface import Link
 from offboard.link.log import FlightLog
@@ -57,8 +57,8 @@ from offboard.run.sitl import (
 from offboard.supervisor.supervisor import Supervisor
 
 REHEARSED_DECISIONS = 5  # the fastest is compared with the deadline: the computer may be busy
+REHEARSAL_S = 60.0  # a law may compile its own code when it is first called
 DISCARDED_MAX = 20  # calls of `Link.receive` that `discard` makes at most
-SITL_TIMEOUT_S = 180.0  # either side of lockstep waits this long for the other, which may compile
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,6 @@ class Simulated:
         """Options of the `simulator` command for a vehicle that sends to the local UDP `port`."""
         return [
             *("--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", "--lockstep"),
-            *("--patience", f"{SITL_TIMEOUT_S:g}"),
             *("--seed", str(seed), "--firmware", self.firmware),
             *(("--scenario", absolute(self.scenario)) if self.scenario else ()),
             *(("--vehicle", absolute(self.vehicle)) if self.vehicle else ()),
@@ -219,9 +218,19 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
     pause of seconds at the first decision in flight would crash the vehicle.
 
     Returns the wall time of the shortest possible decision in seconds, NaN without
-    `keeps_deadline`. Raises DocumentError if the control law fails or, with `keeps_deadline`, if
-    a decision cannot meet the deadline.
+    `keeps_deadline`. Raises DocumentError if the control law fails, does not return within
+    REHEARSAL_S or, with `keeps_deadline`, if a decision cannot meet the deadline.
     """
+    law = prepared.config.controller.law
+    try:
+        return within(REHEARSAL_S, lambda: _rehearsed(prepared, keeps_deadline=keeps_deadline))
+    except TimeoutError:
+        raise DocumentError(
+            f"controller: the law {law} has not returned in {REHEARSAL_S:g} s"
+        ) from None
+
+
+def _rehearsed(prepared: Prepared, *, keeps_deadline: bool) -> float:
     config, controller = prepared.config, prepared.controller
     observer = Observer(config.vehicle)
     reference = hold((0.0, 0.0, -2.0), 0.1)
@@ -254,9 +263,8 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
 
 
 def _decided(controller: Controller, situation: Situation) -> Command | PositionCommand:
-    """Let the controller decide and return its command. Raises DocumentError if it raises, returns
-    a command that cannot be sent, or changes the given state."""
-    given = deepcopy(situation.state)
+    """Let the controller decide and return its command. Raises DocumentError if it raises, or
+    returns a command that cannot be sent."""
     with outside("controller"):
         command = decision_of(controller, situation).command
     if not usable(command):
@@ -264,9 +272,6 @@ def _decided(controller: Controller, situation: Situation) -> Command | Position
             f"controller: it decides {command}, which cannot be sent: all values must be finite "
             "numbers, vectors tuples of three, and the thrust direction of length 1"
         )
-    # the flight compares the given state with the motion that follows
-    if not all(map(np.array_equal, astuple(situation.state), astuple(given))):
-        raise DocumentError("controller: it changes the state that it is given; let it use a copy")
     return command
 
 
@@ -309,8 +314,7 @@ def fly(
     """Fly `config` once with `vehicle` and log the flight in `directory`.
 
     `progress` is called often during the flight; `tell` is called with sentences about the
-    preparation. `simulator` and `stops` may be shared by several flights; without them this flight
-    makes its own.
+    preparation. `simulator` (by default a process) and `stops` may be shared by several flights.
 
     Example: `fly(load("flight"), Path("flights/1"), Simulated()).exit_code` is 0 if the vehicle has
     flown the reference and landed.
@@ -322,17 +326,17 @@ def fly(
     simulated = isinstance(vehicle, Simulated)
     with ExitStack() as stack:
         stops = stops or stack.enter_context(StopRequests())
-        prepared = build(config)
-        log = FlightLog(directory, prepared.text, real_time=not simulated)
-        log.check()
         signing = vehicle.signing(stack)
         if isinstance(vehicle, Simulated):
-            simulator = simulator or stack.enter_context(SimulatorProcess())
+            simulator = simulator or SimulatorProcess()
             link = vehicle.open_link(simulator, config.seed)
             stack.callback(simulator.recall)
         else:
             link = open_link(vehicle.address)
         stack.callback(link.close)
+        prepared = build(config)  # while the simulator starts
+        log = FlightLog(directory, prepared.text, real_time=not simulated)
+        log.check()
         supervisor = None if simulated else stack.enter_context(Supervisor(signing))
         tell("preparing the controller")
         prepare(tell)
@@ -340,6 +344,7 @@ def fly(
         if supervisor:
             supervisor.await_ready()
         stops.check()
+        stops.in_flight = True  # from now on there is a log, which must not end without an outcome
         stack.enter_context(log)
         session = Session(vehicle.settings(link), signing)
         for piece in configuration_pieces(prepared.text):
@@ -351,7 +356,6 @@ def fly(
             stops=stops,
             progress=progress,
             simulator=simulator if simulated else None,
-            patience_s=SITL_TIMEOUT_S,
             supervisor=supervisor,
         )
         if supervisor:

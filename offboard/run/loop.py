@@ -4,7 +4,6 @@ link and log. The telemetry of the vehicle paces it."""
 from __future__ import annotations
 
 import gc
-import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, Protocol
@@ -21,6 +20,7 @@ from offboard.supervisor.supervisor import Supervisor
 POLL_S = 0.02  # longest wait for telemetry in a turn
 SEND_WITHIN_S = 0.2  # after the beginning of a turn; later its frames are dropped
 FAILING_S = 0.3  # the loop ends after this time without a successful turn
+SIMULATOR_S = 180.0  # longest wait (wall time) for the bundled simulator, which may compile
 UNGUARDED = "the supervisor ended: nobody lands the vehicle if this process dies"
 UNANSWERED = "the supervisor does not answer: nobody lands the vehicle if this process dies"
 ANSWERS = "the supervisor answers again"
@@ -54,8 +54,8 @@ class Loop:
     """Moves bytes between one link, one flight (or the service) and one log until the flight ends.
 
     `progress` is called often, to show the flight's announcements to the user; it must not wait.
-    A flight in the bundled `simulator` ends after `patience_s` of wall time without a datagram. All
-    other vehicles have a `supervisor`, a process that outlives this one.
+    A flight in the bundled `simulator` ends after SIMULATOR_S without a datagram. All other
+    vehicles have a `supervisor`, a process that outlives this one.
     """
 
     def __init__(
@@ -67,7 +67,6 @@ class Loop:
         stops: StopRequests,
         progress: Callable[[Any], None],
         simulator: SimulatorProcess | InMemorySimulator | None = None,
-        patience_s: float = math.inf,
         supervisor: Supervisor | None = None,
     ) -> None:
         self._flown = flown
@@ -76,7 +75,6 @@ class Loop:
         self._stops = stops
         self._progress = progress
         self._simulator = simulator
-        self._patience_s = patience_s
         self._supervisor = supervisor
         self._warned: set[str] = set()
         self._unguarded = ""  # UNGUARDED or UNANSWERED once announced; empty while it guards
@@ -232,11 +230,11 @@ class Loop:
             self._progress = lambda flight: None
 
     def _check_simulator(self, silent_s: float) -> None:
-        """End the flight if the bundled simulator has ended, or has not sent for `patience_s`."""
+        """End the flight if the bundled simulator has ended, or has not sent for SIMULATOR_S."""
         if self._simulator is None or self._flown.has_ended():
             return
         ending = self._simulator.ending()
-        if ending is None and silent_s > self._patience_s:
+        if ending is None and silent_s > SIMULATOR_S:
             ending = Ending(f"the bundled simulator has not answered for {silent_s:.1f} s", False)
         if ending is None:
             return

@@ -1,21 +1,17 @@
 """Runs the bundled simulator, either as a process that is watched and always stopped, or in this
-process without a socket (for campaigns). A flight is the same with either, byte for byte.
+process without a socket (campaigns, pytest). A flight is the same with either, byte for byte.
 
-`offboard` never imports `simulator`. They exchange MAVLink; a pipe carries the simulator's options.
-The simulator in this process is found by its entry point.
+`offboard` never imports `simulator`. They exchange MAVLink. The simulator in this process is found
+by its entry point.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import select
-import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Hashable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -27,7 +23,8 @@ from offboard.link import clock
 from offboard.link.interface import Chunk, Link
 
 OWN_VEHICLES = {"px4": "px4_sih", "ardupilot": "arducopter"}  # the simulator's default vehicles
-STOP_S = 2.0  # for the vehicle's process to end, before it is killed
+# the process ends when the pipe to it closes, also if this process was killed
+PROGRAM = "from simulator.cli import main_until_input_ends; main_until_input_ends()"
 ERRORS_BYTES = 65536  # read from stderr of a simulator that has ended
 USAGE = 2  # the simulator's exit code for options and files that it cannot use
 GROUP, NAME = "pso_offboard.simulators", "bundled"  # the simulator's entry point
@@ -57,62 +54,28 @@ def check_scenario(text: str, source: str) -> None:
 
 
 class SimulatorProcess:
-    """Context manager for `python -m simulator.pool`. The pool loads the simulator once, then
-    starts one vehicle after the other, each as its child process. Leaving the context ends all
-    processes."""
+    """Runs one vehicle after the other, each in a process of its own."""
 
-    def __init__(self) -> None:
-        self._ending: Ending | None = None
+    process: subprocess.Popen[bytes]
 
-    def __enter__(self) -> SimulatorProcess:
-        self._open()
-        return self
-
-    def _open(self) -> None:
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
+    def launch(self, options: Sequence[str]) -> None:
+        """Start a vehicle with `options` of the `simulator` command."""
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `recall`
         self.process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "simulator.pool"],
-            bufsize=0,
+            [sys.executable, "-P", "-c", PROGRAM, *options],
             stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
             stderr=self._errors,
             # Ctrl-C must reach only our process, which lands the vehicle
             start_new_session=True,
         )
 
-    def launch(self, options: Sequence[str]) -> None:
-        """Start a vehicle with `options` of the `simulator` command."""
-        if self.process.poll() is not None:  # the pool died in an earlier flight
-            self.close()
-            self._open()
-        self._errors_before = os.fstat(self._errors.fileno()).st_size
-        self._ending = None
-        self._write(json.dumps(options).encode() + b"\n")
-
-    def ending(self, timeout_s: float = 0.0) -> Ending | None:
-        """How the vehicle's process ended, or None if it still runs after `timeout_s`."""
-        assert self.process.stdout is not None
-        if self._ending is None and select.select([self.process.stdout], [], [], timeout_s)[0]:
-            code = self.process.stdout.readline()
-            self._ending = self._explain(int(code) if code else self.process.wait())
-            if not code:
-                self.close()  # the pool died, its vehicle may still run
-        return self._ending
-
-    def recall(self) -> None:
-        """End the vehicle's process."""
-        if self.ending() is None:
-            self._write(b"\n")
-            if self.ending(STOP_S) is None:
-                self.close()
-
-    def _write(self, line: bytes) -> None:
-        assert self.process.stdin is not None
-        with suppress(BrokenPipeError):  # the pool died; `ending` reports it
-            self.process.stdin.write(line)
-
-    def _explain(self, code: int) -> Ending:
-        errors = os.pread(self._errors.fileno(), ERRORS_BYTES, self._errors_before)
+    def ending(self) -> Ending | None:
+        """How the vehicle's process ended, or None while it runs."""
+        code = self.process.poll()
+        if code is None:
+            return None
+        errors = os.pread(self._errors.fileno(), ERRORS_BYTES, 0)
         lines = errors.decode(errors="replace").strip().splitlines()
         if code == USAGE:
             return Ending(lines[-1] if lines else "the bundled simulator refused its options", True)
@@ -120,19 +83,13 @@ class SimulatorProcess:
         detail = f": {lines[-1]}" if lines else ""
         return Ending(f"the bundled simulator ended ({how}){detail}", False)
 
-    def close(self) -> None:
-        """End all processes."""
-        if self._errors.closed:
-            return
-        with suppress(ProcessLookupError, PermissionError):  # no process is left
-            os.killpg(self.process.pid, signal.SIGKILL)  # the pool and its vehicle
+    def recall(self) -> None:
+        """End the vehicle's process."""
+        self.process.kill()
         self.process.wait()
-        for pipe in (self.process.stdin, self.process.stdout, self._errors):
-            assert pipe is not None
-            pipe.close()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        self._errors.close()
 
 
 # --- in this process ---
@@ -188,7 +145,7 @@ class InMemorySimulator:
         self._link = InMemoryLink(vehicle)
         return self._link
 
-    def ending(self, timeout_s: float = 0.0) -> Ending | None:
+    def ending(self) -> Ending | None:
         """How the vehicle ended, or None while it runs."""
         problem = self._link.problem if self._link else None
         if problem is None:

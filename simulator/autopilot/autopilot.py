@@ -77,7 +77,7 @@ class Autopilot:
         accepted = mode.behaviour is Behaviour.SETPOINT
         if message != ATTITUDE:
             accepted = accepted and mode.needs_position
-        if not (accepted or self.firmware.setpoints_outlive_modes):
+        if self.firmware.ardupilot_setpoints and not accepted:
             return
         setpoint, refusal = self._read_setpoint(message, values)
         self.commander.texts += () if refusal is None else (refusal,)

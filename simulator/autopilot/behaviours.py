@@ -218,7 +218,7 @@ class FollowSetpoint(ActiveBehaviour):
 
     @property
     def automatic(self) -> bool:
-        return self.guidance.firmware.setpoints_as_automatic
+        return self.guidance.firmware.ardupilot_setpoints
 
 
 BEHAVIOURS: Mapping[Behaviour, type[ActiveBehaviour]] = {

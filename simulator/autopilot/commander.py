@@ -196,7 +196,7 @@ class Commander:
             self._intended = name
             if mode.remembered:
                 self._remembered = name
-        if mode is not self.mode and not self._firmware.setpoints_outlive_modes:
+        if mode is not self.mode and self._firmware.ardupilot_setpoints:
             self._guidance.newest = None
         # a request of the present mode does not begin it again
         if mode is not self.mode or self._event in ("takeoff", ""):
@@ -212,7 +212,7 @@ class Commander:
 
     def _disarm(self) -> None:
         self.armed, self._delayed = False, None
-        if self._firmware.home_item_first:
+        if self._firmware.ardupilot_commands:
             self._guidance.mission.reset()
         self._controller.enter(self.mode.behaviour)  # begins again when the vehicle is armed again
 

@@ -115,10 +115,14 @@ class Firmware(ABC):
     set_mode_acked_as: int | None = None  # MAV_CMD in the answer to SET_MODE; None: no answer
     force_codes: Mapping[str, float]  # param2 of MAV_CMD_COMPONENT_ARM_DISARM that forces it
     reposition_mode: str  # mode that MAV_CMD_DO_REPOSITION enters
-    # True: MAV_CMD_DO_REPOSITION needs a frame and a place, and its yaw and speed are ignored; the
-    # height of MAV_CMD_NAV_TAKEOFF is above home; MAV_CMD_MISSION_START must not name an item.
-    # False: the height of MAV_CMD_NAV_TAKEOFF is above mean sea level
-    strict_places: bool = False
+    # True: commands and missions as in ArduPilot. MAV_CMD_DO_REPOSITION needs a frame and a place,
+    # and its yaw and speed are ignored; the height of MAV_CMD_NAV_TAKEOFF is above home;
+    # MAV_CMD_MISSION_START must not name an item. Item 0 of a mission is home, a takeoff item does
+    # not make the vehicle descend, disarming resets the mission, and a MISSION_ITEM with current =
+    # 2 is a place to fly to at once.
+    # False: as in PX4. The height of MAV_CMD_NAV_TAKEOFF is above mean sea level; a landing item
+    # counts as reached already above its place
+    ardupilot_commands: bool = False
     # result of MAV_CMD_DO_CHANGE_SPEED without a speed, and of MAV_CMD_GET_MESSAGE_INTERVAL of an
     # unknown message
     empty_refusal: Result
@@ -130,23 +134,19 @@ class Firmware(ABC):
 
     # setpoints
     global_frames: frozenset[int]  # MAV_FRAMEs accepted in SET_POSITION_TARGET_GLOBAL_INT
-    setpoint_mode_needs_stream: bool = False  # without a stream, its pre-arm checks fail
-    setpoints_as_automatic: bool = False  # speed and turn rate limits are those of automatic flight
-    setpoints_outlive_modes: bool = False  # taken in any mode, and kept when the mode changes
-    # with attitude setpoints any thrust counts as flight, and no landing is detected
-    setpoints_imply_flight: bool = False
+    # True: setpoints as in ArduPilot. Speed and turn rate limits are those of automatic flight;
+    # with attitude setpoints any thrust counts as flight, and no landing is detected.
+    # False: as in PX4. They are taken in any mode, and kept when the mode changes; without a stream
+    # the pre-arm checks of their mode fail
+    ardupilot_setpoints: bool = False
 
     # missions
     requests_kind_of_peer: bool = False  # requests items with or without _INT, as the peer last did
     # MAV_FRAME of a downloaded item, by its message and the MAV_FRAME of the upload
     item_frames: Mapping[str, Mapping[int, int]]
-    # item 0 of a mission is home, a takeoff item does not make the vehicle descend, disarming
-    # resets the mission, and a MISSION_ITEM with current = 2 is a place to fly to at once
-    home_item_first: bool = False
     mission_text: StatusText | None = None  # text after an upload
     # MAV_CMD -> name in the texts about the progress of a mission; without names there are none
     item_titles: Mapping[int, str] = field(default_factory=dict)
-    reached_above_landing: bool = False  # "item reached" also when above the place of a landing
     turning_items: frozenset[int] = frozenset()  # MAV_CMDs of items whose param4 is a yaw
 
     # telemetry
@@ -177,9 +177,9 @@ class Firmware(ABC):
     never_to_all: frozenset[str] = frozenset()
     text_suffix: str = ""  # appended to each STATUSTEXT
     text_to_ground_stations_only: bool = False  # STATUSTEXTs wait for a ground station
-    parameters_bytewise: bool = False  # PARAM_VALUE holds the bytes of an integer, not its value
-    parameters_hashed: bool = False  # a list begins with _HASH_CHECK
-    parameters_numbered: bool = False  # PARAM_VALUE.param_index is set also outside a list
+    # parameters as in PX4: PARAM_VALUE has the bytes of an integer, not its value; a list begins
+    # with _HASH_CHECK; param_index is set also outside a list
+    px4_parameters: bool = False
     accepted_unsigned: frozenset[int]  # ids of messages that need no signature
     stamps_follow_clock: bool = False  # of signatures; False: they only count
 

@@ -133,7 +133,7 @@ class Guidance:
         flown as automatic flight (ArduCopter), a setpoint of another kind than the last one resets
         the requested speed."""
         self.region_ned_m = None
-        if self.firmware.setpoints_as_automatic and _kind(setpoint) != _kind(self.newest):
+        if self.firmware.ardupilot_setpoints and _kind(setpoint) != _kind(self.newest):
             self.cruise_mps = math.inf
         self.newest = setpoint
 

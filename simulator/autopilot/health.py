@@ -151,7 +151,7 @@ class Health:
             return False
         if mode.behaviour is Behaviour.MISSION:
             return self._guidance.mission.flyable
-        needs_stream = mode.behaviour is Behaviour.SETPOINT and firmware.setpoint_mode_needs_stream
+        needs_stream = mode.behaviour is Behaviour.SETPOINT and not firmware.ardupilot_setpoints
         return not needs_stream or self._guidance.stream_alive(now_s)
 
     def can_run(self, mode: Mode, now_s: float) -> bool:

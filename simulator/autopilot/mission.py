@@ -88,7 +88,7 @@ class Mission:
     @property
     def first(self) -> int:
         """Number of the item with which the mission begins."""
-        return int(self.firmware.home_item_first)
+        return int(self.firmware.ardupilot_commands)
 
     @property
     def flyable(self) -> bool:
@@ -195,7 +195,7 @@ class Mission:
         lands = item.command == Kind.LAND
         if math.isnan(self._since_s) and self._near(item, estimate.position_ned_m):
             self._since_s = estimate.time_s
-            if lands and self.firmware.reached_above_landing and self._approaching:
+            if lands and self._approaching and not self.firmware.ardupilot_commands:
                 self._report_reached()
         self._approaching = math.isnan(self._since_s)
         if self._approaching:
@@ -289,7 +289,7 @@ class Mission:
         north, east, down = self._position(item, home_ned_m)
         if item.command == Kind.TAKEOFF:
             north, east = self._target_ned_m[:2]
-            down = min(down, here_ned_m[2]) if self.firmware.home_item_first else down
+            down = min(down, here_ned_m[2]) if self.firmware.ardupilot_commands else down
         if item.command == Kind.LAND:
             down = here_ned_m[2] if self.landing else self._target_ned_m[2]
         if item.command == Kind.LOITER_TURNS:

@@ -25,7 +25,7 @@ class ParameterTable:
         self._specs = {spec.name: spec for spec in firmware.parameters}
         self._values = {spec.name: spec.default for spec in firmware.parameters}
         self._sources: Mapping[str, Role] = firmware.parameter_roles
-        self._bytewise = firmware.parameters_bytewise
+        self._bytewise = firmware.px4_parameters
         self.names = tuple(self._specs)
         self._take_roles()
 

@@ -202,7 +202,7 @@ class PositionController:
 
     def _detect_landing(self, setpoint: AttitudeSetpoint | None, estimate: StateEstimate) -> None:
         was_landed, by_motion = self.landed, setpoint is None
-        if not by_motion and self._firmware.setpoints_imply_flight:
+        if not by_motion and self._firmware.ardupilot_setpoints:
             self.detector.reset()
             if self.thrust_demanded > 0.0:
                 self.detector.set_landed(False)

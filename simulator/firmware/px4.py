@@ -246,11 +246,8 @@ PX4 = Px4(
         224: Result.UNSUPPORTED,  # clients use the message MISSION_SET_CURRENT
     },
     global_frames=frozenset({5, 6, 11}),
-    setpoint_mode_needs_stream=True,
-    setpoints_outlive_modes=True,
     requests_kind_of_peer=True,
     item_frames={"MISSION_ITEM": {5: 0, 6: 3}, "MISSION_ITEM_INT": {0: 5, 3: 6}},
-    reached_above_landing=True,
     turning_items=frozenset({16, 17, 19, 21}),
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
@@ -269,9 +266,7 @@ PX4 = Px4(
     never_to_all=frozenset({"COMMAND", "MISSION", "PARAM"}),
     text_suffix="\t",
     text_to_ground_stations_only=True,
-    parameters_bytewise=True,
-    parameters_hashed=True,
-    parameters_numbered=True,
+    px4_parameters=True,
     # those of 1.17, as 1.16 has no signing: HEARTBEAT, RADIO_STATUS, ADSB_VEHICLE, COLLISION
     accepted_unsigned=frozenset({0, 109, 246, 247}),
     # gyro, accelerometer, magnetometer, absolute pressure, GPS; battery, AHRS; the health bits

@@ -101,7 +101,7 @@ class Commands:
 
     def _takeoff(self, autopilot: Autopilot, command: Command) -> Result:
         height_m = command.params[6]
-        if autopilot.firmware.strict_places:
+        if autopilot.firmware.ardupilot_commands:
             if command.frame not in (None, _RELATIVE):
                 return Result.DENIED
             down_m = autopilot.guidance.home_ned_m[2] - height_m
@@ -117,8 +117,8 @@ class Commands:
         and longitude 0), or a place in degrees and AMSL metres. It is kept when the vehicle arms,
         but PX4 does not keep a present position."""
         latitude, longitude, height_m = command.params[4:7]
-        strict = autopilot.firmware.strict_places
-        here = command.params[0] == 1.0 or (strict and latitude == longitude == 0.0)
+        ardupilot = autopilot.firmware.ardupilot_commands
+        here = command.params[0] == 1.0 or (ardupilot and latitude == longitude == 0.0)
         if self.outbox.view.withheld("HOME_POSITION"):
             return autopilot.firmware.request_refusal
         if here:
@@ -128,19 +128,19 @@ class Commands:
             autopilot.guidance.home_ned_m = (north, east, autopilot.firmware.origin[2] - height_m)
         else:
             return Result.DENIED
-        autopilot.guidance.home_kept = strict or not here
+        autopilot.guidance.home_kept = ardupilot or not here
         return autopilot.handle("home")
 
     def _reposition(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_DO_REPOSITION: fly to a place and hold it. The present position replaces
         coordinates that are not finite."""
-        strict, mode = autopilot.firmware.strict_places, autopilot.firmware.reposition_mode
-        there = strict and autopilot.commander.mode.name == mode
+        ardupilot, mode = autopilot.firmware.ardupilot_commands, autopilot.firmware.reposition_mode
+        there = ardupilot and autopilot.commander.mode.name == mode
         if command.params[1] != _CHANGE_MODE and not there:
-            return Result.DENIED if strict and command.frame is not None else Result.UNSUPPORTED
+            return Result.DENIED if ardupilot and command.frame is not None else Result.UNSUPPORTED
         yaw_rad, latitude, longitude, height_m = command.params[3:7]
-        speed_mps = math.inf if strict or not command.params[0] > 0.0 else command.params[0]
-        if strict:
+        speed_mps = math.inf if ardupilot or not command.params[0] > 0.0 else command.params[0]
+        if ardupilot:
             if command.frame is None:
                 return Result.UNSUPPORTED
             on_earth = abs(latitude) <= 90.0 and abs(longitude) <= 180.0
@@ -243,15 +243,15 @@ class Commands:
 
     def _start_mission(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_MISSION_START; for ArduCopter it is a request of mode AUTO."""
-        strict = autopilot.firmware.strict_places
-        if strict and any(command.params[:2]):
+        ardupilot = autopilot.firmware.ardupilot_commands
+        if ardupilot and any(command.params[:2]):
             return Result.DENIED
         first = command.params[0] if math.isfinite(command.params[0]) else 0.0
         if not -1 <= first < max(1, len(autopilot.mission.items)):
             return Result.DENIED
         modes = autopilot.firmware.modes.values()
         mode = next(mode.name for mode in modes if mode.behaviour is Behaviour.MISSION)
-        return autopilot.handle("mode" if strict else "mission", Request(mode))
+        return autopilot.handle("mode" if ardupilot else "mission", Request(mode))
 
     def _set_current_item(self, autopilot: Autopilot, command: Command) -> Result:
         number = command.params[0]

@@ -155,7 +155,7 @@ class Server:
                 link._parameters.show(message.param_id)
 
     def _mission_item(self, message: Message) -> None:
-        if not (self.view.autopilot.firmware.home_item_first and message.current == _GUIDED):
+        if not (self.view.autopilot.firmware.ardupilot_commands and message.current == _GUIDED):
             self._missions.item(message)
             return
         scale = 1e-7 if message.get_type().endswith("INT") else 1.0

@@ -44,7 +44,7 @@ class ParameterTransfer:
             return
         value, kind = autopilot.parameters.to_wire(name)
         names = autopilot.parameters.names
-        numbered = listed or autopilot.firmware.parameters_numbered
+        numbered = listed or autopilot.firmware.px4_parameters
         index = names.index(name) if numbered else NO_INDEX
         self.outbox.send("PARAM_VALUE", name.encode(), value, kind, len(names), index)
 
@@ -58,7 +58,7 @@ class ParameterTransfer:
             self.show(message.param_id)
 
     def _is_hash(self, name: str) -> bool:
-        return name == HASH and self.outbox.view.autopilot.firmware.parameters_hashed
+        return name == HASH and self.outbox.view.autopilot.firmware.px4_parameters
 
     def request_list(self, _: Message) -> None:
         """Handle PARAM_REQUEST_LIST. A list under way starts again, without _HASH_CHECK."""
@@ -222,7 +222,7 @@ class MissionTransfer:
         peer, kind = sender_of(message), message.mission_type
         items = self.mission.stored.get(kind, ())
         self._whole = whole = message.get_type() == "MISSION_REQUEST_INT"
-        is_home = self._firmware.home_item_first and message.seq == kind == 0
+        is_home = self._firmware.ardupilot_commands and message.seq == kind == 0
         if not (is_home or message.seq < len(items)):
             self._acknowledge(peer, Ack.ERROR, kind)
             return

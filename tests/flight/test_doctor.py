@@ -21,6 +21,7 @@ from pydantic import TypeAdapter
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.doctor import computer, run
+from offboard.doctor.checks import OF_VEHICLE
 from offboard.doctor.listening import LONGEST_S, NOTHING_S, Observation
 from offboard.doctor.run import OF_COMPUTER, Rows, examine, verdict
 from offboard.flight.phases import Limits
@@ -28,7 +29,7 @@ from offboard.flight.preflight import Finding, Ground, Level, findings
 from offboard.flight.vehicle_state import VehicleState
 from offboard.link import clock
 from offboard.link.interface import Chunk
-from offboard.mavlink.events import ESTIMATE, Attitude, EstimatorReport, GpsFix
+from offboard.mavlink.events import ESTIMATE, Attitude, EstimatorReport, GpsFix, VehicleFound
 from offboard.mavlink.senders import DIALECTS
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import UNITS_PER_S, Signing
@@ -297,10 +298,6 @@ FOUND: list[tuple[Any, ...]] = [
     ({"firmware": ARDUPILOT, "parameters": {"GUID_OPTIONS": 2.0, "ATC_ANGLE_BOOST": 0.0}},
      ("parameters", BLOCKS, "param set GUID_OPTIONS 10$"),
      ("parameters", BLOCKS, "param set ATC_ANGLE_BOOST 1$")),
-    # the parameters of another type of vehicle mean something else
-    ({"firmware": ARDUPILOT, "parameters": {"GUID_OPTIONS": 0.0},
-      "down": partial(heartbeats(type=10), 0.0)},
-     ("vehicle", BLOCKS, "GROUND_ROVER; offboard flies multirotors"), ("parameters", OK, "")),
     ({"assignments": ["reference.period_s=1.2"]}, ("configuration", BLOCKS, "reference")),
     # in the words of ArduCopter 4.6.3
     ({"firmware": ARDUPILOT, "mode": "GUIDED", "boot_s": 9.0,
@@ -403,6 +400,15 @@ def test_silent_vehicle_is_not_ready_to_fly(start: Start | None) -> None:
     assert not verdict({"rates": rates}, complete=True).startswith("ready to fly")
 
 
+def test_another_type_of_vehicle_has_no_other_rows() -> None:
+    """Its telemetry and its parameters mean something else."""
+    rover = partial(heartbeats(type=10), 0.0)
+    rows = bench(firmware=ARDUPILOT, parameters={"GUID_OPTIONS": 0.0}, down=rover).check()
+    (finding,) = (each for each in rows["vehicle"] if each.level is BLOCKS)
+    assert finding.found == "the vehicle is a GROUND_ROVER; offboard flies multirotors"
+    assert not rows.keys() & {check.__name__ for check in OF_VEHICLE}
+
+
 def test_gps_loss_waits_until_the_fix_returns() -> None:
     tested = bench(faults=[{"fault": "gps_loss", "at_s": 0.5, "for_s": 12.0, "drift_mps": 0.1}])
     rows = tested.check()
@@ -441,6 +447,7 @@ def test_estimator_without_position_waits_then_blocks(boot_s: float, level: Leve
     )
     starting.heard_s[GpsFix] = starting.now_s
     session = Session(SessionSettings())
+    session.senders.set_vehicle(VehicleFound(1, 1, "px4"), None)
     model = load("flight").vehicle
     ground = Ground(limits=Limits(), session=session, model=model, vehicle=starting)
     assert {found.level for check, _, found in findings(ground) if check == "estimator"} == {level}

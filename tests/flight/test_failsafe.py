@@ -149,7 +149,6 @@ def tilt(flight: Any, angle_rad: float) -> None:
 
 def tilt_from_commands(flight: FlightState, angle_rad: float) -> None:
     flight.commands.extend([Command(9.8, (0.0, 0.0, 1.0), 0.0)] * 7)
-    flight.thrusts.extend([0.5] * 7)
     tilt(flight, angle_rad)
 
 
@@ -261,7 +260,7 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("blind", blind, 0.5, 0.51),
     ("age", aged, AGE_S, 0.26),
     ("link", clock(delay_growth_s=float), 0.3, 0.31),
-    ("link", aged, AGE_S, 0.26),
+    ("late", aged, AGE_S, 0.26),
     ("uplink", unanswered, 10, 11),
     ("uplink", partial(unanswered, delay_s=0.6), 10, 11),
     ("decision", holding(missed_decisions=int, failure=lambda _: "it was late"), 0, 1),
@@ -272,9 +271,9 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("prediction", predicted, 2.0, 2.01),
     ("estimator", holding(jumps=lambda jumped_m: jumps(jumped_m, 0.0)), 2.0, 2.1),
     ("estimator", holding(jumps=lambda drift_m: jumps(0.0, drift_m)), 2.0, 2.1),
-    ("positioning", accuracy, (0.5, 3.0), (0.5, 3.1)),
-    ("positioning", accuracy, (None, None), (0.5, None)),
-    ("positioning", valid, frozenset(ESTIMATE), frozenset(ESTIMATE[:1])),
+    ("accuracy", accuracy, (0.5, 3.0), (0.5, 3.1)),
+    ("validity", accuracy, (None, None), (0.5, None)),
+    ("validity", valid, frozenset(ESTIMATE), frozenset(ESTIMATE[:1])),
     ("positioning", no_fix, 1.0, 2.1),
     ("positioning", repeats, 1.5, 1.6),
     ("positioning", partial(repeats, last=()), 1.5, 1.6),

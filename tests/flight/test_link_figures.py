@@ -75,7 +75,7 @@ CONFIGURED_RADPS = 7.0
 )
 def test_growing_link_delay_lowers_the_bandwidth(direction: str, most_m: float) -> None:
     """The link becomes late in flight, and later prompt again. If the delay were assumed to be that
-    at take-off, 0.2 s more would cause an error of 2.1 m."""
+    at takeoff, 0.2 s more would cause an error of 2.1 m."""
     pair = over(through, "reference.height_m=3.0", aloft=False, boot_scale=1.0)
     limits: list[tuple[float, float]] = []  # begin, and limit of the bandwidth
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import random
+import threading
 from dataclasses import replace
 from typing import Any
 
@@ -27,6 +28,7 @@ from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command, PredictedState
 from offboard.reference.track import hold
 from offboard.run import configuration as config
+from offboard.run import flight
 from offboard.run.flight import build, rehearse
 
 LEVEL = Command(9.8, (0.0, 0.0, 1.0), 0.0)
@@ -80,7 +82,7 @@ def without_a_text(_: Situation) -> Decision:
         (with_text, "controller: it decides Command.*, which cannot be sent"),
         (without_a_command, r"TypeError: \(9.8, .*\) is no Command .*\(.*test_parts\.py:\d+\)"),
         (without_a_decision, r"returns Command\(.*, not a Decision \(.*\.py:\d+\)"),
-        (changing_its_input, "controller: it changes the state that it is given; let it use a"),
+        (changing_its_input, r"controller: ValueError: .* read-only \(.*test_parts\.py:\d+\)"),
         (without_a_text, r"controller: Unprintable: it cannot be printed \(.*test_parts\.py:\d+\)"),
         (raises, r"controller: ZeroDivisionError: nothing to divide by \(.*faults\.py:\d+\)"),
         (no_direction, "controller: it decides Command.*, which cannot be sent"),
@@ -109,6 +111,15 @@ def test_rehearsal_finds_a_law_that_exits_the_program(
     says = r"controller.*: SystemExit: 3 \(.*test_parts\.py:\d+\)"
     with pytest.raises(DocumentError, match=says):
         rehearse(built if of_a_law else build(resolved), keeps_deadline=False)
+
+
+def test_rehearsal_finds_a_law_that_never_returns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flight, "REHEARSAL_S", 0.1)
+    prepared, ended = build(config.load("flight", known_vehicle="px4_sih")), threading.Event()
+    law = failing(lambda situation: ended.wait(), after=0)(prepared.controller)
+    with pytest.raises(DocumentError, match=r"the law pso has not returned in 0.1 s"):
+        rehearse(replace(prepared, controller=law), keeps_deadline=False)
+    ended.set()
 
 
 def test_rehearsal_finds_a_law_that_fails_at_its_deadline(

@@ -143,7 +143,7 @@ def believed_heavy() -> Pair:
 
 def one_wrong_heartbeat(on: Vehicle, phase: Phase) -> Row:
     """One HEARTBEAT wrongly shows the vehicle disarmed. Regression: the vehicle was then left alone
-    in the air, or in its own take-off."""
+    in the air, or in its own takeoff."""
     wrong = then(phase, 0.3, downlink(disarmed(most=1)))
 
     def told(pair: Pair) -> None:
@@ -221,7 +221,7 @@ ROWS = {
     ),
     # the autopilot brakes the climb with 2.5 m/s2 after it was asked to land
     "above the ceiling": ends(
-        "2 m above and 0 m from the take-off point", landed, fly=partial(px4.hop, HIGH),
+        "2 m above and 0 m from the takeoff point", landed, fly=partial(px4.hop, HIGH),
         limits={"ceiling_m": 2.0}, failsafes=["volume"], top_m=3.25,
     ),
     "the vehicle reports disarmed while it flies": aborts(
@@ -283,7 +283,7 @@ ROWS = {
     # flights that go on
     "a load that only the vehicle file has": flies(fly=believed_heavy, failsafes=()),
     "one wrong heartbeat in track": one_wrong_heartbeat(px4, Phase.TRACK),
-    "one wrong heartbeat in the take-off": one_wrong_heartbeat(copter, Phase.TAKEOFF),
+    "one wrong heartbeat in the takeoff": one_wrong_heartbeat(copter, Phase.TAKEOFF),
     "one wrong heartbeat in the landing": one_wrong_heartbeat(px4, Phase.LAND),
     # as by `offboard fly`: nothing is known of the vehicle, which is identified in flight
     "all disturbances together": flies(

@@ -67,7 +67,7 @@ def test_growing_link_delay_ends_in_hold_and_landing(scenario: str, on: Vehicle)
     watch = aborted(pair, says, error_m=0.6, top_m=4.0)
     ends = [Phase.TRACK, Phase.HOLD, Phase.LAND, Phase.DISARMED]
     assert [phase for _, phase in pair.phases][-4:] == ends
-    assert pair.failsafes == {"age": Action.LEVEL, "link": Action.HOLD}
+    assert pair.failsafes == {"age": Action.LEVEL, "late": Action.HOLD}
     dialect = pair.companion.current.dialect
     assert dialect is not None
     hold = (*dialect.hold().parameters, 0.0)[1:3]  # a missing parameter is sent as 0

@@ -502,14 +502,14 @@ ROWS = {
     "a ground station sets a parameter in flight, twice": flies(
         says_the_change, fly=px4.hover, at=tracking(set_parameter),
     ),
-    "take-off by command": flies(took_off_by_command, fly=copter.hop),
-    "take-off refused": ends(
+    "takeoff by command": flies(took_off_by_command, fly=copter.hop),
+    "takeoff refused": ends(
         ".*no lift-off in 8 s by the .* is MOT_THST_HOVER right", stayed_down_without_a_setpoint,
         fly=copter.hop,
         firmware=replace(ARDUPILOT, rules=(NO_TAKEOFF, *ARDUPILOT.rules)),
     ),
     # it is given longer than 8 s, until it disarms by itself
-    "take-off refused by a helicopter, whose rotor does not turn": ends(
+    "takeoff refused by a helicopter, whose rotor does not turn": ends(
         "the vehicle disarmed before lift-off; .* command 22 FAILED",
         stayed_down_without_a_setpoint, fly=copter.hop, believed=HELICOPTER,
         down=faults.heartbeats(type=4),

@@ -295,7 +295,7 @@ def test_anchor_origin_needs_a_known_takeoff_point(served: Served) -> None:
     pair.until(lambda: pair.mode == "BRAKE", 1.0)
     assert thrusts(pair, engaged_s) == []
     assert len(commanded(pair, engaged_s)) == 1
-    assert said(pair, "not engaged: its take-off point is not known")
+    assert said(pair, "not engaged: its takeoff point is not known")
 
 
 def test_the_volume_begins_at_the_take_off_point_wherever_the_pilot_engages(served: Served) -> None:
@@ -309,7 +309,7 @@ def test_the_volume_begins_at_the_take_off_point_wherever_the_pilot_engages(serv
     pair.service.current.limits = Limits(radius_m=3.0)  # of this flight alone
     pair.switch("engage")
     pair.run(3.0)
-    assert said(pair, "not engaged: 3 m above and 5 m from the take-off point (limits.ceiling_m")
+    assert said(pair, "not engaged: 3 m above and 5 m from the takeoff point (limits.ceiling_m")
     assert pair.state.vehicle.mode == "AUTO.LOITER"
     pair.engage()
     assert pair.state.from_takeoff_m == pytest.approx(pair.place * (1, 1, -1), abs=0.1)
@@ -319,7 +319,7 @@ def test_the_volume_begins_at_the_take_off_point_wherever_the_pilot_engages(serv
 def test_service_started_in_the_air_refuses_a_vehicle_above_the_ceiling(
     served: Served, holds: bool
 ) -> None:
-    """The take-off point was not seen; heights are above the local origin. A vehicle that cannot
+    """The takeoff point was not seen; heights are above the local origin. A vehicle that cannot
     hold, as without a global position, goes back to the mode that its pilot flew by sticks."""
     pair = served.aloft(rules=() if holds else (faults.CANNOT_HOLD,))
     pair.instance.autopilot.parameters.set("COM_RC_LOSS_T", 35.0)
@@ -332,7 +332,7 @@ def test_service_started_in_the_air_refuses_a_vehicle_above_the_ceiling(
     pair.switch("engage")
     pair.until(lambda: pair.phase is Phase.HAND_BACK, 1.0)
     pair.until(lambda: pair.phase is Phase.STANDBY, 3.0)
-    assert said(pair, "not engaged: 3 m above and 0 m from the take-off point (limits.ceiling_m")
+    assert said(pair, "not engaged: 3 m above and 0 m from the takeoff point (limits.ceiling_m")
     assert pair.state.vehicle.mode == ("AUTO.LOITER" if holds else "POSCTL")
 
 

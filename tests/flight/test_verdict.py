@@ -154,7 +154,7 @@ def test_flight_with_ground_contact_is_not_completed() -> None:
 
 def test_restart_before_the_flight_is_not_scored() -> None:
     """The stamps of its reports before the restart, in the air, occur again in the flight.
-    Regression: both were mixed, and by the score a flight ended 3.3 m above the take-off point."""
+    Regression: both were mixed, and by the score a flight ended 3.3 m above the takeoff point."""
     restarts = {"fault": "reboot", "after": "boot", "at_s": 1.0}
     scenario = scenario_of(restarts, conditions={"clock_start_s": 12.0})
     pair = hover(scenario=scenario, aloft=True)
@@ -286,7 +286,7 @@ def test_touchdown_tells_landings_from_falls() -> None:
         (touchdown(before_mps=3.0), ""),
         (touchdown(rests_s=0.1), "it has not come to rest"),
         (hard, f"fell at up to {hard.speed_mps:.1f} m/s"),
-        (reporting(2.8, 0.0, 1e-4), "2.8 m above the take-off point"),
+        (reporting(2.8, 0.0, 1e-4), "2.8 m above the takeoff point"),
         (reporting(0.8, 0.7, 0.0), "it has not come to rest"),
     ):
         assert landing.not_landed(on_ground=True) == says

@@ -46,7 +46,7 @@ class Vehicle:
         return self.hop(*assignments, **{"aloft": True} | options)
 
     def hop(self, *assignments: str, **options: Any) -> Pair:
-        """Create the same hover with a take-off."""
+        """Create the same hover with a takeoff."""
         return self.make(*SHORT, *assignments, reference="hover", **options)
 
     def __str__(self) -> str:

@@ -22,7 +22,7 @@ FLIGHTS, SECONDS, RATE_HZ = 12, 60, 50
 
 
 def _errors(estimator: str) -> dict[str, np.ndarray]:
-    """Estimate minus truth, (flight, sample, axis), 20 to 80 s after take-off, hover."""
+    """Estimate minus truth, (flight, sample, axis), 20 to 80 s after takeoff, hover."""
     vehicle = load("px4_sih" if estimator == "px4_like" else "arducopter")
     level = Demand(True, vehicle.hover_thrust, attitude())
     estimated, true = [], []

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -16,7 +16,8 @@ from processes import Called, Spawn, children, free_port
 
 from offboard import cli
 from offboard.cli.shared import out
-from offboard.run import sitl
+from offboard.run import flight
+from offboard.run.sitl import InMemorySimulator
 from simulator import cli as simulator_cli
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # signals that commands handle
@@ -110,4 +111,4 @@ def refused(called: Called, tmp_path: Path) -> Callable[..., str]:
 @pytest.fixture
 def in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """`fly --sitl` flies its simulated vehicle in this process."""
-    monkeypatch.setattr(sitl, "SimulatorProcess", lambda: nullcontext(sitl.InMemorySimulator()))
+    monkeypatch.setattr(flight, "SimulatorProcess", InMemorySimulator)

@@ -262,13 +262,19 @@ def test_invalid_campaign_file_is_refused(
 def test_case_key_depends_on_referenced_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """They are relative to the file that names them."""
     monkeypatch.chdir(tmp_path)
-    shipped = (CONFIG / "flight.yaml").read_text()
-    (tmp_path / "mine.yaml").write_text(shipped.replace("lemniscate", "./path.yaml"))
+    mine, shipped = Path("mine"), (CONFIG / "flight.yaml").read_text()
+    mine.mkdir()
+    (mine / "flight.yaml").write_text(shipped.replace("lemniscate", "path.yaml"))
+    (mine / "all.yaml").write_text("config: flight.yaml\nseeds: 1\n")
+    (mine / "path.yaml").write_text("shape: table\nfile: path.csv\n")
     keys = set()
     for height_m in (2, 3, 3):
-        (tmp_path / "path.yaml").write_text(f"shape: hover\nduration_s: 1\nheight_m: {height_m}")
-        keys.add(next(base_cases(CampaignFile(config="./mine.yaml"))).key)
+        rows = "".join(f"{10 * row},{row},0,{height_m}\n" for row in range(5))
+        (mine / "path.csv").write_text(f"time_s,north_m,east_m,altitude_m\n{rows}")
+        file, _ = load_document("mine/all.yaml", "campaign", CampaignFile)
+        keys.add(next(base_cases(file)).key)
     assert len(keys) == 2
 
 

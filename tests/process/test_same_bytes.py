@@ -3,7 +3,6 @@ machine that is busy or idle."""
 
 from __future__ import annotations
 
-import os
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -21,7 +20,7 @@ from offboard.flight.phases import Outcome, Phase
 from offboard.flight.record import RECORD_ID, TickRecord
 from offboard.link.stop import StopRequests
 from offboard.mavlink.session import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.run import flight, sitl
+from offboard.run import loop, sitl
 from offboard.run.configuration import load
 from offboard.run.flight import Simulated, fly
 from offboard.run.sitl import InMemorySimulator, SimulatorProcess
@@ -74,9 +73,9 @@ class LateSimulator(SimulatorProcess):
     """Starts each vehicle a tenth of a second after the launch."""
 
     def launch(self, options: Sequence[str]) -> None:
-        os.killpg(self.process.pid, signal.SIGSTOP)
         super().launch(options)
-        Timer(0.1, os.killpg, (self.process.pid, signal.SIGCONT)).start()
+        self.process.send_signal(signal.SIGSTOP)
+        Timer(0.1, self.process.send_signal, (signal.SIGCONT,)).start()
 
 
 def test_frames_are_identical_over_udp_with_stalls(
@@ -90,9 +89,8 @@ def test_frames_are_identical_over_udp_with_stalls(
         if companion.phase is Phase.TRACK and stalls:
             time.sleep(stalls.pop())
 
-    with LateSimulator() as simulator:
-        outcome = flown(tmp_path / "flight", LATE, simulator, progress=progress,
-                        tell=lambda _: time.sleep(1.0))  # fmt: skip
+    outcome = flown(tmp_path / "flight", LATE, LateSimulator(), progress=progress,
+                    tell=lambda _: time.sleep(1.0))  # fmt: skip
     assert (outcome.exit_code, stalls) == (0, [])
     sent = frames(tmp_path / "flight")
     assert set(sent) == {VEHICLE_COMPONENT_ID, COMPONENT_ID, RECORD_COMPONENT_ID}
@@ -121,7 +119,7 @@ def test_failing_or_hanging_simulator_ends_the_flight(
         return lambda **options: SimpleNamespace(exchange=exchange)
 
     monkeypatch.setattr(sitl, "registered", lambda: SimpleNamespace(load=load))
-    monkeypatch.setattr(flight, "SITL_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(loop, "SIMULATOR_S", 0.1)
     outcome = flown(tmp_path / "flight", Simulated(scenario="calm"), InMemorySimulator())
     assert outcome.exit_code == 3
     assert outcome.sentence.startswith(says)

@@ -7,7 +7,6 @@ Several clients of a link: `wire/test_sim_sockets.py`, `wire/test_sim_link.py`.
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import socket
@@ -15,7 +14,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from processes import Called, children, ended, eventually, free_port
+import pytest
+from processes import Called, eventually, free_port
 from sim_peer import Peer, simulator
 
 from offboard.analysis import tlog
@@ -83,56 +83,56 @@ SHORT = ("reference.height_m=1", "identify.excite=false")
 
 
 @contextmanager
-def flying(pool: SimulatorProcess) -> Iterator[int]:
-    """Launch a vehicle in lockstep; yield its process id once it has sent something."""
+def flying(simulator: SimulatorProcess) -> Iterator[None]:
+    """Launch a vehicle in lockstep, which has sent something then."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours:
         ours.bind(("127.0.0.1", 0))
         ours.settimeout(30.0)
         port = ours.getsockname()[1]
-        pool.launch(["--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", "--lockstep"])
+        simulator.launch(["--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", "--lockstep"])
         assert ours.recv(65535)
-        (vehicle,) = children(pool.process.pid)
-        yield vehicle
+        yield
+        simulator.recall()
 
 
-def test_pool_reports_each_ended_vehicle_and_launches_the_next() -> None:
-    with SimulatorProcess() as pool:
-        pid = pool.process.pid
-        for options, says in (
-            (["--scenario", "storm"], "there is no scenario named 'storm'; known are"),
-            (["--firmware", "betaflight"], "--firmware betaflight is unknown"),
-        ):
-            pool.launch(options)
-            ending = pool.ending(10.0)
-            assert ending is not None
-            assert (ending.unusable, ending.sentence.startswith(says)) == (True, True)
-            with flying(pool) as vehicle:
-                os.kill(vehicle, signal.SIGKILL)
-                assert pool.ending(10.0) == KILLED  # not the previous sentence
-        with flying(pool):
-            assert pool.ending() is None
-        pool.recall()
-        assert (children(pool.process.pid), pool.process.pid) == ([], pid)
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--scenario", "storm"], "there is no scenario named 'storm'; known are"),
+        (["--firmware", "betaflight"], "--firmware betaflight is unknown"),
+    ],
+)
+def test_simulator_process_reports_its_end_and_launches_the_next(
+    options: list[str], says: str
+) -> None:
+    simulator = SimulatorProcess()
+    simulator.launch(options)
+    eventually(simulator.ending)
+    ending = simulator.ending()
+    assert ending is not None
+    assert (ending.unusable, ending.sentence.startswith(says)) == (True, True)
+    simulator.recall()
+    with flying(simulator):
+        assert simulator.ending() is None
+        simulator.process.kill()
+        eventually(lambda: simulator.ending() == KILLED)  # not the previous sentence
+    with flying(simulator):
+        assert simulator.process.stdin is not None
+        simulator.process.stdin.close()  # as when this process is killed
+        eventually(simulator.ending)
 
 
-def test_killed_simulator_ends_the_flight_and_is_replaced(tmp_path: Path) -> None:
-    lost: list[int] = []
+def test_killed_simulator_ends_the_flight(tmp_path: Path) -> None:
+    simulator = SimulatorProcess()
 
     def kill(companion: Flight) -> None:
-        if companion.phase is Phase.TRACK and not lost:
-            lost.extend((*children(pool.process.pid), pool.process.pid))
-            os.kill(pool.process.pid, signal.SIGKILL)
+        if companion.phase is Phase.TRACK:
+            simulator.process.kill()
 
     config = load("flight", choices={"reference": "hover"}, assignments=SHORT)
-    with SimulatorProcess() as pool:
-        outcome = fly(
-            config, tmp_path / "x", Simulated(scenario="calm"), simulator=pool, progress=kill
-        )
-        assert (outcome.exit_code, outcome.sentence) == (4, KILLED.sentence)
-        log = tlog.read(tmp_path / "x" / "flight.tlog")
-        assert sum(entry.name == "SET_ATTITUDE_TARGET" for entry in log) > 50
-        orphan, first = lost
-        eventually(lambda: ended(orphan))
-        with flying(pool):
-            assert pool.process.pid != first
-    assert ended(pool.process.pid)
+    outcome = fly(
+        config, tmp_path / "x", Simulated(scenario="calm"), simulator=simulator, progress=kill
+    )
+    assert (outcome.exit_code, outcome.sentence) == (4, KILLED.sentence)
+    log = tlog.read(tmp_path / "x" / "flight.tlog")
+    assert sum(entry.name == "SET_ATTITUDE_TARGET" for entry in log) > 50

@@ -165,6 +165,22 @@ def test_infeasible_reference_is_refused_with_time_value_and_limit(
     assert 0.0 < float(found[2]) <= flown.duration_s + 0.005
 
 
+@pytest.mark.parametrize("jump_s", [150.0, 200.0])
+def test_jump_of_the_tilt_rate_is_refused_at_any_time(jump_s: float) -> None:
+    """Also where one of the parts ends in which a reference is checked."""
+
+    class Jumping:
+        duration_s = 300.0
+
+        def sample(self, time_s: NDArray[np.float64]) -> FlatSample:
+            still = hold((0.0, 0.0, -2.0), 0.0).sample(time_s)
+            jerk_mps3 = np.outer(time_s > jump_s - 0.005, [8.0, 0.0, 0.0])
+            return still._replace(jerk_ned_mps3=jerk_mps3)
+
+    with pytest.raises(ValueError, match=f"pitch acceleration of .* at {jump_s:.2f} s"):
+        check(Jumping(), vehicle())
+
+
 @pytest.mark.parametrize(
     ("assignments", "end"),
     [
