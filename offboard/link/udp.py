@@ -179,7 +179,8 @@ class UdpLink(Link):
             return
         listening = self._listening
         before, self._vehicle = self._vehicle, None
-        if before:
+        if before:  # the supervisor still has it, with the port
+            before.socket.setsockopt(socket.SOL_SOCKET, _SHARE_PORT, 1)
             before.socket.close()
         try:
             sock = _second_socket(listening.socket, peer)

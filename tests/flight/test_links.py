@@ -265,7 +265,10 @@ def test_vehicle_may_change_its_port_after_an_observed_silence(
                 now_s[0] += 1.1 * PEER_SILENT_S
                 sender.send(b"moved")
                 assert data(link.receive()) == [b"moved"]
+                supervisors = [os.dup(each) for each in link.descriptors()]
                 link.follow(sender.getsockname())
+                for each in supervisors:
+                    os.close(each)
                 sender.send(b"v")
                 assert data(received(link)) == [b"v"]
         # after a long silence also a sender is heard that has sent while the vehicle did
