@@ -18,7 +18,7 @@ from contextlib import suppress
 from offboard.link import clock
 from offboard.link.interface import Chunk, Link
 from offboard.mavlink.framing import TIMESYNC, frame_size
-from offboard.mavlink.senders import PEER_SILENT_S, same_host
+from offboard.mavlink.senders import OTHER_VEHICLE_S, PEER_SILENT_S, same_host
 
 DATAGRAM_SIZE = 65535
 BUFFER_BYTES = 1 << 20
@@ -130,25 +130,27 @@ class UdpLink(Link):
 
         Datagrams of other senders are counted, and returned only if they may come from a new port
         of the vehicle: from its host, after a silence of PEER_SILENT_S in which this process did
-        not pause, and from a port that has not sent beside the vehicle's within BESIDE_S (such a
-        port belongs to another sender, even if it has the same system id). Datagrams of the vehicle
+        not pause, or from any host after OTHER_VEHICLE_S, and from a port that has not sent beside
+        the vehicle's within BESIDE_S (such a port belongs to another sender, even if it has the
+        same system id). Datagrams of the vehicle
         are returned, too: it sent them before its socket was connected, or to a broadcast address.
         """
         now_s = clock.monotonic_s()
         found = listening.drain(LOOK_MAX) if now_s >= self._look_s else []
         ours = [chunk for chunk in found if chunk.peer == self._peer]
         others = [chunk for chunk in found if chunk.peer != self._peer]
-        silent = now_s - self._heard_s > PEER_SILENT_S
+        silent_s = now_s - self._heard_s
         if others:
             self._look_s = now_s + LOOK_EVERY_S
-        near = {chunk.peer for chunk in others if same_host(chunk.peer, self._peer)}
+        moved = silent_s > OTHER_VEHICLE_S
+        near = {chunk.peer for chunk in others if moved or same_host(chunk.peer, self._peer)}
         if heard or ours:
             self._heard_s = now_s
             if self._newer:
                 known = {port: end_s for port, end_s in self._beside.items() if end_s > now_s}
                 self._beside = known | dict.fromkeys(self._newer, now_s + BESIDE_S)
                 self._newer.clear()
-        elif silent:
+        elif silent_s > PEER_SILENT_S:
             near = {port for port in near if self._beside.get(port, now_s) <= now_s}
             ours = [chunk for chunk in others if chunk.peer in near]
             others = [chunk for chunk in others if chunk.peer not in near]
