@@ -20,7 +20,6 @@ from offboard.documents.errors import Unavailable, UserError
 
 _LINUX = sys.platform == "linux"
 _NAME_MAX = 90  # characters; an abstract address has at most 107
-_SYSTEM_MAX = 255  # greatest system id of MAVLink
 _REFUSED_MAX = 4096  # backlog: refused services that can still find out who holds a lock
 
 
@@ -68,8 +67,7 @@ def name_lock(name: str, excluded: Iterable[str], what: str) -> Iterator[None]:
 
 
 def _holder(name: str) -> int | None:
-    """Id of the process that holds the lock on an abstract address, 0 if it is not known; None if
-    nobody holds it."""
+    """Id of the process that holds a `name_lock`, 0 if it is not known; None if nobody does."""
     with socket.socket(socket.AF_UNIX) as client:
         client.setblocking(False)
         try:
@@ -89,10 +87,9 @@ def connection_lock(connection: str, system_id: int | None = None) -> AbstractCo
     name = f"offboard-{re.sub(r'[^A-Za-z0-9.]+', '-', connection)}"[:_NAME_MAX]
     what, excluded = f"connection {connection}", []
     if connection.startswith("tcp:"):
-        name, *excluded = f"{name}-0", *(f"{name}-{number}" for number in range(1, _SYSTEM_MAX + 1))
+        name, *excluded = (f"{name}-{system}" for system in range(256))
         if system_id:
             name, excluded = excluded[system_id - 1], [name]
-            what += f" --system {system_id}"
     if _LINUX:
         return name_lock(name, excluded, what)
     return file_lock(Path(tempfile.gettempdir()) / f"{name}.lock", what)

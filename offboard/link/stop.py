@@ -16,7 +16,6 @@ AGAIN_S = 1.0  # signals within this time are one request: `timeout` signals chi
 
 
 def interrupt() -> None:
-    """Raise KeyboardInterrupt."""
     raise KeyboardInterrupt
 
 

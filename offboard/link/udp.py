@@ -1,5 +1,4 @@
 """UDP links. Once the vehicle is known, a second socket on the same local port is connected to it.
-Then no other sender can fill its receive buffer or use up our time.
 
 Linux lets two sockets share a port with SO_REUSEADDR, macOS with SO_REUSEPORT. The option is
 cleared afterwards, so that no other program can share the port.
@@ -99,9 +98,8 @@ class UdpLink(Link):
         self._vehicle = _Inbox(vehicle) if vehicle else None
         self._peer: Hashable = vehicle.getpeername() if vehicle else None
         self._heard_s = clock.monotonic_s()  # when a datagram of the vehicle was last read
-        # Other ports of the vehicle's host. `_beside`: ports that have sent while the vehicle's own
-        # did, and the host time until which they cannot be the vehicle's; `_newer`: ports heard
-        # since the last datagram of the vehicle
+        # `_beside`: ports that have sent while the vehicle did, and host times until which they are
+        # other senders; `_newer`: ports heard since its last datagram
         self._beside: dict[Hashable, float] = {}
         self._newer: set[Hashable] = set()
         self._look_s = 0.0  # host time at which other senders are read next
@@ -129,11 +127,8 @@ class UdpLink(Link):
         """Read the listening socket. `heard`: whether the vehicle's own socket had datagrams.
 
         Datagrams of other senders are counted, and returned only if they may come from a new port
-        of the vehicle: from its host, after a silence of PEER_SILENT_S in which this process did
-        not pause, or from any host after OTHER_VEHICLE_S, and from a port that has not sent beside
-        the vehicle's within BESIDE_S (such a port belongs to another sender, even if it has the
-        same system id). Datagrams of the vehicle
-        are returned, too: it sent them before its socket was connected, or to a broadcast address.
+        of the vehicle. Those of the vehicle, too: it sent them before its socket was connected, or
+        to a broadcast address.
         """
         now_s = clock.monotonic_s()
         found = listening.drain(LOOK_MAX) if now_s >= self._look_s else []

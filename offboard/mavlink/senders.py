@@ -6,10 +6,8 @@ and mode commands that another sender sends to our vehicle, and other companion 
 reported.
 
 After a restart mavlink-router and MAVProxy send from another port. Therefore another port of the
-same host becomes the vehicle's address if it sends the vehicle's frames after the known port was
-silent; while no flight has begun, also another host after a longer silence. The link passes on
-datagrams of another address only after it has checked that the silence was neither an overflow of
-the socket's buffer nor a pause of this process.
+same host becomes the vehicle's address if it sends the vehicle's frames after a silence (see
+`link.udp`), and before a flight also another host.
 """
 
 from __future__ import annotations
