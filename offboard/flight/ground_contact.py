@@ -102,10 +102,10 @@ class GroundContact:
 
     @property
     def on_ground(self) -> bool:
-        """Whether the vehicle is disarmed, or its land detector, height and vertical speed all show
-        that it stands."""
+        """Whether the vehicle is disarmed and its land detector shows no flight (the HEARTBEAT may
+        be another vehicle's), or detector, height and vertical speed all show that it stands."""
         if self.vehicle.disarmed:
-            return True
+            return not self.detects_flight
         position = self.vehicle.position
         return (
             self.detected == "on_ground"

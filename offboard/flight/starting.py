@@ -23,10 +23,10 @@ from offboard.flight.preflight import armed_already, other_sender, other_vehicle
 from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, DISARMED_S
 from offboard.mavlink.events import Heartbeat
+from offboard.mavlink.senders import OTHER_VEHICLE_S
 
 ARM_DISARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
 ARMING_SHOWN_S = 2.5  # HEARTBEAT, at 1 Hz, shows an accepted arming within this time
-OTHER_VEHICLE_S = 5.0  # after a longer silence another vehicle may be on the link
 PREARM_S = 10.0  # time for the pre-arm checks of the mode that PX4 shows, without GPS
 LISTENED_S = 0.5  # time to hear another sender of setpoints: PX4 leaves OFFBOARD below 2 Hz
 

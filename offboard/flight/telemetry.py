@@ -94,7 +94,7 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
         case VehicleFound():
             outbox.send(flight, vehicle_record(event))
         case PeerChanged(peer):
-            outbox.announce(flight, f"the vehicle now sends from another port: {peer_name(peer)}")
+            outbox.announce(flight, f"the vehicle now sends from {peer_name(peer)}")
         case OtherCompanion(system, component):
             same = component == AUTOPILOT_COMPONENT
             sentence = (SAME_IDS if same else OTHER_COMPANION).format(

@@ -6,8 +6,7 @@ tcp:HOST:PORT      connect to a listening autopilot (ArduPilot SITL)
 tcpin:HOST:PORT    listen for one client
 serial:DEVICE:BAUD
 
-An IPv6 address is in brackets, for example udpin:[::1]:14540. A TCP connection or serial port that
-breaks is opened again until the link is closed.
+An IPv6 address is in brackets, for example udpin:[::1]:14540.
 """
 
 from __future__ import annotations

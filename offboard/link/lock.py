@@ -12,7 +12,7 @@ import socket
 import struct
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
@@ -50,36 +50,48 @@ def file_lock(path: Path, what: str) -> Iterator[None]:
 
 
 @contextmanager
-def name_lock(name: str, what: str) -> Iterator[None]:
-    """Hold a lock, as `file_lock`, but on an abstract Unix address (Linux only). All users and
-    units see it, and it belongs to a network namespace, as ports do. Raises Unavailable."""
+def name_lock(name: str, excluded: Iterable[str], what: str) -> Iterator[None]:
+    """Hold a lock, as `file_lock`, but on an abstract Unix address (Linux only), and only if nobody
+    holds the locks `excluded`. All users and units see it, and it belongs to a network namespace,
+    as ports do. Raises Unavailable."""
     with socket.socket(socket.AF_UNIX) as held:
         try:
             held.bind(f"\0{name}")
             held.listen(_REFUSED_MAX)
         except OSError:
-            raise _held(what, _holder(held, f"\0{name}")) from None
+            raise _held(what, _holder(name) or 0) from None
+        for other in excluded:  # after `bind`: of two that start together, at least one is refused
+            if (holder := _holder(other)) is not None:
+                raise _held(what, holder)
         yield
 
 
-def _holder(unbound: socket.socket, address: str) -> int:
-    """Id of the process that has bound `address`; 0 if it is not known."""
-    with suppress(OSError):
-        unbound.setblocking(False)
-        unbound.connect(address)
-        shown = unbound.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
+def _holder(name: str) -> int | None:
+    """Id of the process that holds a `name_lock`, 0 if it is not known; None if nobody does."""
+    with socket.socket(socket.AF_UNIX) as client:
+        client.setblocking(False)
+        try:
+            client.connect(f"\0{name}")
+        except ConnectionRefusedError:
+            return None
+        except BlockingIOError:  # _REFUSED_MAX services have asked before
+            return 0
+        shown = client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
         return int(struct.unpack("3i", shown)[0])
-    return 0
 
 
 def connection_lock(connection: str, system_id: int | None = None) -> AbstractContextManager[None]:
     """The lock that allows one service for each connection, whichever user has started it. On a
-    connection to a TCP server it allows one for each `--system`: a router has many vehicles."""
-    which = f"{system_id or 0}-" if connection.startswith("tcp:") else ""
-    name = f"offboard-{which}{re.sub(r'[^A-Za-z0-9.]+', '-', connection)}"[:_NAME_MAX]
-    what = f"connection {connection}" + (f" --system {system_id}" if which and system_id else "")
+    connection to a TCP server, as a router has many vehicles, it allows one for each `--system`, or
+    one without it (Linux only: elsewhere one of each kind)."""
+    name = f"offboard-{re.sub(r'[^A-Za-z0-9.]+', '-', connection)}"[:_NAME_MAX]
+    what, excluded = f"connection {connection}", []
+    if connection.startswith("tcp:"):
+        name, *excluded = (f"{name}-{system}" for system in range(256))
+        if system_id:
+            name, excluded = excluded[system_id - 1], [name]
     if _LINUX:
-        return name_lock(name, what)
+        return name_lock(name, excluded, what)
     return file_lock(Path(tempfile.gettempdir()) / f"{name}.lock", what)
 
 

@@ -1,8 +1,4 @@
-"""The time stamps of a signing key, kept on disk so that they never go back.
-
-There is one file for each key; its name has a hash of the key. The file contains a stamp that is
-up to a minute ahead of the newest one, so that even after a crash no frame has had it yet.
-"""
+"""The time stamps of a signing key, kept on disk so that they never go back."""
 
 from __future__ import annotations
 

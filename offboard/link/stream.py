@@ -45,7 +45,6 @@ def connect(host: str, port: int) -> Stream:
 
 
 def tcp_stream(connection: socket.socket, host: str) -> Stream:
-    """A connected socket as a stream."""
     connection.setblocking(False)
     with suppress(OSError):
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -247,8 +246,7 @@ class RedialingLink(StreamLink):
 
 
 class ListeningLink(StreamLink):
-    """Accepts one client on `listening`. Another client can replace it once it is silent for
-    PEER_SILENT_S; after the vehicle was found, only a client from the vehicle's host."""
+    """Accepts one client at a time on `listening`, as the README says."""
 
     def __init__(self, listening: socket.socket, name: str, stream: Stream | None = None) -> None:
         super().__init__(stream, name)

@@ -1,5 +1,4 @@
 """UDP links. Once the vehicle is known, a second socket on the same local port is connected to it.
-Then no other sender can fill its receive buffer or use up our time.
 
 Linux lets two sockets share a port with SO_REUSEADDR, macOS with SO_REUSEPORT. The option is
 cleared afterwards, so that no other program can share the port.
@@ -18,7 +17,7 @@ from contextlib import suppress
 from offboard.link import clock
 from offboard.link.interface import Chunk, Link
 from offboard.mavlink.framing import TIMESYNC, frame_size
-from offboard.mavlink.senders import PEER_SILENT_S, same_host
+from offboard.mavlink.senders import OTHER_VEHICLE_S, PEER_SILENT_S, same_host
 
 DATAGRAM_SIZE = 65535
 BUFFER_BYTES = 1 << 20
@@ -99,9 +98,8 @@ class UdpLink(Link):
         self._vehicle = _Inbox(vehicle) if vehicle else None
         self._peer: Hashable = vehicle.getpeername() if vehicle else None
         self._heard_s = clock.monotonic_s()  # when a datagram of the vehicle was last read
-        # Other ports of the vehicle's host. `_beside`: ports that have sent while the vehicle's own
-        # did, and the host time until which they cannot be the vehicle's; `_newer`: ports heard
-        # since the last datagram of the vehicle
+        # `_beside`: ports that have sent while the vehicle did, and host times until which they are
+        # other senders; `_newer`: ports heard since its last datagram
         self._beside: dict[Hashable, float] = {}
         self._newer: set[Hashable] = set()
         self._look_s = 0.0  # host time at which other senders are read next
@@ -129,26 +127,25 @@ class UdpLink(Link):
         """Read the listening socket. `heard`: whether the vehicle's own socket had datagrams.
 
         Datagrams of other senders are counted, and returned only if they may come from a new port
-        of the vehicle: from its host, after a silence of PEER_SILENT_S in which this process did
-        not pause, and from a port that has not sent beside the vehicle's within BESIDE_S (such a
-        port belongs to another sender, even if it has the same system id). Datagrams of the vehicle
-        are returned, too: it sent them before its socket was connected, or to a broadcast address.
+        of the vehicle. Those of the vehicle, too: it sent them before its socket was connected, or
+        to a broadcast address.
         """
         now_s = clock.monotonic_s()
         found = listening.drain(LOOK_MAX) if now_s >= self._look_s else []
         ours = [chunk for chunk in found if chunk.peer == self._peer]
         others = [chunk for chunk in found if chunk.peer != self._peer]
-        silent = now_s - self._heard_s > PEER_SILENT_S
+        silent_s = now_s - self._heard_s
         if others:
             self._look_s = now_s + LOOK_EVERY_S
-        near = {chunk.peer for chunk in others if same_host(chunk.peer, self._peer)}
+        moved = silent_s > OTHER_VEHICLE_S
+        near = {chunk.peer for chunk in others if moved or same_host(chunk.peer, self._peer)}
         if heard or ours:
             self._heard_s = now_s
             if self._newer:
                 known = {port: end_s for port, end_s in self._beside.items() if end_s > now_s}
                 self._beside = known | dict.fromkeys(self._newer, now_s + BESIDE_S)
                 self._newer.clear()
-        elif silent:
+        elif silent_s > PEER_SILENT_S:
             near = {port for port in near if self._beside.get(port, now_s) <= now_s}
             ours = [chunk for chunk in others if chunk.peer in near]
             others = [chunk for chunk in others if chunk.peer not in near]
@@ -179,7 +176,8 @@ class UdpLink(Link):
             return
         listening = self._listening
         before, self._vehicle = self._vehicle, None
-        if before:
+        if before:  # the supervisor still has it, with the port
+            before.socket.setsockopt(socket.SOL_SOCKET, _SHARE_PORT, 1)
             before.socket.close()
         try:
             sock = _second_socket(listening.socket, peer)

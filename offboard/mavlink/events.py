@@ -226,8 +226,7 @@ class Parameter(Event):
 
 @dataclass(frozen=True, slots=True)
 class PeerChanged(Event):
-    """The vehicle now sends from another port of its host, for example after a restart of
-    mavlink-router."""
+    """The vehicle now sends from another address, for example after a restart of mavlink-router."""
 
     peer: Hashable
 

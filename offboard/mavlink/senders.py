@@ -6,9 +6,8 @@ and mode commands that another sender sends to our vehicle, and other companion 
 reported.
 
 After a restart mavlink-router and MAVProxy send from another port. Therefore another port of the
-same host becomes the vehicle's address if it sends the vehicle's frames after the known port was
-silent. The link passes on datagrams of another address only after it has checked that the silence
-was neither an overflow of the socket's buffer nor a pause of this process.
+same host becomes the vehicle's address if it sends the vehicle's frames after a silence (see
+`link.udp`), and before a flight also another host.
 """
 
 from __future__ import annotations
@@ -51,6 +50,7 @@ COMMANDS = COMMAND_INT, COMMAND_LONG = 75, 76
 # MAV_CMD: return, land, take off, set the mode, go to a place, begin a mission, arm or disarm
 _MODE_COMMANDS = frozenset({20, 21, 22, 176, 192, 300, 400})
 PEER_SILENT_S = 0.5  # half of `Limits.silence_s`, so that the flight can continue on a new port
+OTHER_VEHICLE_S = 5.0  # after a longer silence another vehicle may be on the link, or another host
 SYSTEMS_MAX = 8  # systems that are remembered
 HEARD_S = 10.0  # a system counts as present for this time after its newest HEARTBEAT
 NOTED_EVERY_S = 1.0  # a system is noted again only after this time
@@ -70,7 +70,8 @@ class Senders:
     `vehicle` and `dialect` are None until the vehicle was found. `own` are our ids; our system id
     is that of the vehicle. `systems` has the time at which each autopilot was heard, to a second;
     `twin_s` the time at which one with the vehicle's system id was heard from another address.
-    `forged` counts the frames that signing refused. Times are `Session.link_time_s`, except
+    `forged` counts the frames that signing refused. `roams`: whether the vehicle may now send from
+    another host. Times are `Session.link_time_s`, except
     `newest_frame_s`: `Session.elapsed_s` of the vehicle's newest frame.
     """
 
@@ -83,6 +84,7 @@ class Senders:
         self.systems: dict[int, float] = {}
         self.twin_s = -math.inf
         self.forged: Counter[Refusal] = Counter()
+        self.roams = False
         self._news_at = 1  # number of forged frames at which `news` reports next
         self._signs = False  # whether an autopilot that signs was heard although we have no key
         self._other_component = 0  # newest component id of an autopilot with another one than 1
@@ -104,7 +106,8 @@ class Senders:
     def moves_to(self, peer: Hashable, now_s: float, datagram: bytes) -> bool:
         """Make `peer` the vehicle's address if the known one is silent and `datagram`, from `peer`,
         has a frame of the vehicle. Returns whether the address has changed."""
-        if now_s - self.newest_frame_s <= PEER_SILENT_S or not same_host(peer, self.peer):
+        silent = now_s - self.newest_frame_s > PEER_SILENT_S
+        if not (silent and (self.roams or same_host(peer, self.peer))):
             return False
         vehicle = self.vehicle
         assert vehicle is not None

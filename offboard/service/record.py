@@ -4,9 +4,6 @@ The rolling log is two files of at most `ROLLING_BYTES`; when one is full, the o
 A flight's log begins with its configuration, with what the vehicle sends only once, and with the
 last seconds before the flight, so that it is complete by itself. Files are opened, written and
 closed by threads: the loop waits for none of them.
-
-Until the vehicle was handed back, a file `engaged` in the directory of a flight holds the key of
-the vehicle. If the service was killed, it tells the next start that this vehicle was left engaged.
 """
 
 from __future__ import annotations
@@ -34,7 +31,7 @@ PARAM_VALUE = 22
 SENT_ONCE = {PARAM_VALUE, 49, 148, 242}  # GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION, HOME_POSITION
 PARAM_ID = slice(8, 24)  # in the payload of PARAM_VALUE
 KEPT_MAX = 100  # most parameters whose newest PARAM_VALUE is kept
-ENGAGED = "engaged"  # file of a flight, see the module
+ENGAGED = "engaged"  # file of a flight, with the key of a vehicle that was not handed back
 ENGAGED_MAX_S = 600.0  # after the end of the log: a vehicle that was left longer ago has landed
 
 
@@ -214,7 +211,6 @@ class Recorder:
             self._clerk.submit(_remove, files)
 
     def close(self) -> None:
-        """Close all logs."""
         if self._closed:
             return
         self._close_flight()

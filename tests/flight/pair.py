@@ -12,7 +12,7 @@ the vehicle goes on; its datagrams wait for the next turn with their times of ar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -112,6 +112,7 @@ class Pair:
     up: Filter = through
     at: list[tuple[Callable[[Pair], bool], Callable[[Pair], object]]] = field(default_factory=list)
     dead: bool = False
+    peer: Hashable = "vehicle"  # address that the vehicle sends from
     time_s: float = 0.0
     steps: int = 0
     turned: int = 0  # value of `steps` at the newest turn
@@ -147,7 +148,7 @@ class Pair:
         self.time_s = self.steps * STEP_S
         now_s = self.host_s
         datagrams = [] if self.dead else self.down(self.time_s, self.instance.step())
-        self.waiting += [Chunk(datagram, "vehicle", now_s) for datagram in datagrams]
+        self.waiting += [Chunk(datagram, self.peer, now_s) for datagram in datagrams]
         if now_s >= self.clock.now_s:
             self.clock.now_s = now_s
             self._feed()

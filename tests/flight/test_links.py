@@ -226,7 +226,7 @@ def test_new_peer_is_announced_as_host_and_port() -> None:
     flight = uneventful()
     for peer in (("127.0.0.1", 14581), ("::1", 14582, 0, 0)):
         telemetry.update(flight, PeerChanged(peer), 0.0, turned_s=0.0)
-    places = [sentence.rpartition(" port: ")[2] for sentence in flight.announced]
+    places = [sentence.rpartition(" from ")[2] for sentence in flight.announced]
     assert places == ["127.0.0.1:14581", "[::1]:14582"]
 
 
@@ -265,7 +265,10 @@ def test_vehicle_may_change_its_port_after_an_observed_silence(
                 now_s[0] += 1.1 * PEER_SILENT_S
                 sender.send(b"moved")
                 assert data(link.receive()) == [b"moved"]
+                supervisors = [os.dup(each) for each in link.descriptors()]
                 link.follow(sender.getsockname())
+                for each in supervisors:
+                    os.close(each)
                 sender.send(b"v")
                 assert data(received(link)) == [b"v"]
         # after a long silence also a sender is heard that has sent while the vehicle did
@@ -273,6 +276,20 @@ def test_vehicle_may_change_its_port_after_an_observed_silence(
             now_s[0] += passed_s
             other.send(b"late")
             assert data(link.receive()) == heard
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="macOS has no second address on loopback")
+def test_after_a_long_silence_other_hosts_are_heard(udp: Udp, now_s: list[float]) -> None:
+    link, vehicle, other = udp
+    link.follow(vehicle.getsockname())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as elsewhere:
+        elsewhere.bind(("127.0.0.2", 0))
+        for silent_s, heard in ((0.0, []), (4.9, []), (0.2, [b"elsewhere"])):
+            now_s[0] += silent_s
+            elsewhere.sendto(b"elsewhere", other.getpeername())
+            assert data(link.receive()) == heard
+        vehicle.send(b"v")
+        assert data(received(link)) == [b"v"]
 
 
 def test_udpout_hears_only_its_peer() -> None:

@@ -619,7 +619,9 @@ def test_parameters_and_uid_are_read_again_after_a_silence(served: Served) -> No
     pair.run(2.0)
 
     assert pair.state.vehicle.uid == 1
+    pair.peer = ("10.0.0.3", 14580)  # its address has changed in the meantime
     silence(pair, 0.0)
+    assert said(pair, "the vehicle now sends from 10.0.0.3:14580")
     assert not said(pair, "another vehicle answers")
     pair.switch("engage")
     pair.until(lambda: pair.mode == "BRAKE", 3.0)

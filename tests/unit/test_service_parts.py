@@ -199,14 +199,18 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
     assert holder.stdout.readline() == b"held\n"
     with connection_lock("udpin:127.0.0.1:2"), connection_lock("tcp:127.0.0.1:1", 2):
         pass  # another connection, another vehicle behind the same router
-    for held in (("udpin:127.0.0.1:1",), ("udpin:127.0.0.1:1", 2), ("tcp:127.0.0.1:1", 1)):
-        again = connection_lock(*held)
+    router = "tcp:127.0.0.1:1"
+    held = ("udpin:127.0.0.1:1",), ("udpin:127.0.0.1:1", 2), (router, 1), (router,)
+    for each in held:
+        again = connection_lock(*each)
         with pytest.raises(Unavailable, match=f"process {holder.pid}$"), again:
             pass
     holder.kill()
     holder.wait()
-    with connection_lock("udpin:127.0.0.1:1"):
-        pass
+    with connection_lock("udpin:127.0.0.1:1"), connection_lock(router):
+        for system in (None, 1, 255):
+            with pytest.raises(Unavailable, match=f"process {os.getpid()}$"):
+                connection_lock(router, system).__enter__()
     ours = f"has the directory {tmp_path}/new.*: process {os.getpid()}$"
     with directory_lock(tmp_path / "new"), pytest.raises(Unavailable, match=ours):
         directory_lock(tmp_path / "new").__enter__()

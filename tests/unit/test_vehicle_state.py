@@ -70,6 +70,17 @@ def test_armed_vehicle_is_on_ground_only_if_all_signs_agree(
     assert vehicle.at(1.0).in_the_air
 
 
+@pytest.mark.parametrize(("detector", "certain"), [("in_air", False), ("unknown", True)])
+def test_disarmed_vehicle_is_on_ground_unless_its_land_detector_shows_flight(
+    detector: str, certain: bool
+) -> None:
+    """Regression: HEARTBEATs of a second vehicle with the same ids, which was disarmed, made the
+    service stream setpoints without thrust to the one in flight."""
+    standing = armed(2.5, detector=detector)
+    standing.heartbeat(1.0, armed=False)
+    assert standing.at(1.0).on_ground is certain
+
+
 @pytest.mark.parametrize(
     ("heights_m", "climb_mps", "lifted"),
     [

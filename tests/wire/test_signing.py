@@ -137,6 +137,7 @@ def test_port_change_needs_a_valid_signature() -> None:
     other = (PEER[0], PEER[1] + 1)
     for key in (b"", OTHER_KEY):
         assert ours.receive(signer(key).position(2000), other, 5.0).events == []
+    assert ours.receive(vehicle.position(2000), ("10.0.0.3", 1), 5.0).events == []
     moved = ours.receive(vehicle.position(2000), other, 5.0).events
     assert moved[0] == events.PeerChanged(other)
     assert len(moved) == 2  # its check did not use up the time stamp
