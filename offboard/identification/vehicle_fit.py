@@ -38,13 +38,14 @@ Pieces = Generator[None, None, Result]
 LEAST_SECONDS = 2.0
 # Least motion: horizontal speed, rms; change of thrust, rms, as a fraction of the hover thrust
 LEAST_SPEED_MPS, LEAST_THRUST_CHANGE = 0.4, 0.015
-# Greatest accepted standard deviations; that of the hover thrust is relative
-DRAG_SD_PS, HOVER_SD, EFFECT_SD_S = 0.2, 0.02, 0.1
+# Greatest accepted standard deviations. That of the hover thrust is relative, and large, because a
+# vehicle file may be wrong by much more; then the drag would be wrong too
+DRAG_SD_PS, HOVER_SD, EFFECT_SD_S = 0.25, 0.05, 0.1
 DRAG_PRIOR_PS = Estimate(0.6, 0.4)
 THRUST_EFFECT = ("thrust_lag_s", "thrust_delay_s", "thrust_effect_s")  # accepted together
 # A link adds the same to all delays. Prior sd of the delays of yaw and thrust without the link, of
 # the thrust's lag, and of the link delay while the tilt is not identified
-YAW_DELAY_SD_S, THRUST_DELAY_SD_S, THRUST_LAG_SD_S, LINK_SD_S = 0.1, 0.03, 0.05, 0.15
+YAW_DELAY_SD_S, THRUST_DELAY_SD_S, THRUST_LAG_SD_S, LINK_SD_S = 0.1, 0.03, 0.08, 0.15
 
 # Greatest lag of an overdamped response if the factor allows no more; ArduCopter with ATC_INPUT_TC
 # 1 has 1 s

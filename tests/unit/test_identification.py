@@ -220,6 +220,14 @@ def test_undetermined_constants_are_refused():
     assert "1.5 s of flight, 2 s are needed" in short.refusals["tilt"]
 
 
+def test_hover_thrust_with_an_sd_of_two_percent_is_used():
+    """A vehicle file may be wrong by far more, and the drag is fitted with the hover thrust."""
+    found = identify(flown(noise=0.6, seconds=3.5), VEHICLE_FILE).hover_thrust
+    assert found is not None
+    assert 0.02 < found.sd / found.value < 0.05
+    assert found.value == pytest.approx(0.5, rel=0.03)
+
+
 def test_newest_rows_are_kept_and_cleaned():
     stamps = [0.0, 0.1, 0.1, 0.05, 0.2, 0.3]
     north = [1.0, 2.0, 3.0, 9.0, math.nan, 4.0]
