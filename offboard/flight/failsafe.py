@@ -12,7 +12,7 @@ import numpy as np
 from offboard.flight.conditions import Condition, blind, mode_unknown, silent
 from offboard.flight.ground_contact import STOOD_S
 from offboard.flight.phases import TRACKING, Action, Limits, Phase
-from offboard.flight.preflight import other_sender
+from offboard.flight.preflight import other_sender, rare_telemetry
 from offboard.flight.state import COMMANDS_KEPT, FlightState
 from offboard.flight.timing import JUMP_S
 from offboard.mavlink.events import MODE_KNOWN_S, EstimatorReport, ThrustReport
@@ -25,6 +25,8 @@ FULL_THRUST = 0.99  # normalised
 # the thrust so far
 LOW_THRUST = 0.5
 STANDS_BELOW_M = 0.25  # below the reference, which is at least 0.3 m above the takeoff point
+# At 3 Hz, with no gap that another row notices, the tilt of a PX4 reached 46 deg
+LEAST_TELEMETRY_HZ = 3.5
 THRUST_REPORT_S = 1.0  # greatest age of a ThrustReport that counts
 ESTIMATOR_REPORT_S = 0.7  # the same for an EstimatorReport; one alone must not hold for a second
 
@@ -42,6 +44,11 @@ def telemetry_old(flight: FlightState) -> str:
     """Age of the newest telemetry beyond the least delay of the last 5 s."""
     age_s = flight.age_s
     return f"telemetry is {age_s:.2f} s old" if age_s > flight.limits.setpoint_age_s else ""
+
+
+def rare(flight: FlightState) -> str:
+    """Rate of the rarer of position and attitude, over 2 s."""
+    return rare_telemetry(flight, LEAST_TELEMETRY_HZ)
 
 
 def late_link(flight: FlightState) -> str:
@@ -288,6 +295,7 @@ ROWS = (
     Row("blind", blind, f"{Limits.blind_s:g} s", LAND, cause="link"),
     Row("age", telemetry_old, "limits.setpoint_age_s", LEVEL, cause="link"),
     Row("late", telemetry_old, "limits.setpoint_age_s", HOLD, 0.5, "link"),
+    Row("rate", rare, f"{LEAST_TELEMETRY_HZ:g} Hz", HOLD, 0.5, "link"),
     Row("link", late_link, "limits.link_growth_s", HOLD, 0.5, "link"),
     Row("uplink", unanswered, "limits.silence_s", HOLD, 0.5, "link"),
     Row("decision", decision_missed, "one", LEVEL, cause=MISSED),

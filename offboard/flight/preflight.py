@@ -280,14 +280,18 @@ def _unguarded(ground: Ground) -> str:
 
 
 def _slow(ground: Ground) -> str:
+    counts = ground.rates_requested and ground.vehicle.has_state
+    return rare_telemetry(ground, MINIMUM_TELEMETRY_HZ) if counts else ""
+
+
+def rare_telemetry(ground: Ground, least_hz: float) -> str:
+    """Position or attitude arrives at less than `least_hz`, measured over 2 s."""
     rates_hz = ground.session.telemetry.rates_hz
-    if not (ground.rates_requested and ground.vehicle.has_state):
-        return ""
     for name in TELEMETRY:
-        if rates_hz.get(name, 0.0) < MINIMUM_TELEMETRY_HZ:
+        if rates_hz.get(name, 0.0) < least_hz:
             return (
-                f"{name} arrives at {rates_hz.get(name, 0.0):.1f} Hz, "
-                f"at least {MINIMUM_TELEMETRY_HZ:.0f} Hz are needed"
+                f"{name} arrives at {rates_hz.get(name, 0.0):.1f} Hz, at least {least_hz:g} Hz "
+                "are needed"
             )
     return ""
 

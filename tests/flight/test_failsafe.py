@@ -104,6 +104,10 @@ def test_clock_steps_and_telemetry_gaps_add_no_hold_time() -> None:
 Measure = Callable[[Any, Any], object]
 
 
+def rare(flight: Any, position_hz: float) -> None:
+    flight.session.telemetry.rates_hz["LOCAL_POSITION_NED"] = position_hz
+
+
 def hears_another(flight: FlightState, since_s: float) -> None:
     flight.vehicle.update(OtherSender(1, 190), NOW_S - since_s)
     flight.vehicle.now_s = NOW_S
@@ -259,6 +263,7 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("silence", holding(telemetry_host_s=float), -1.0, -1.1),
     ("blind", blind, 0.5, 0.51),
     ("age", aged, AGE_S, 0.26),
+    ("rate", rare, 3.5, 3.0),
     ("link", clock(delay_growth_s=float), 0.3, 0.31),
     ("late", aged, AGE_S, 0.26),
     ("uplink", unanswered, 10, 11),

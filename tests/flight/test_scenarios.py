@@ -279,6 +279,12 @@ def held_soon(pair: Pair) -> None:
     assert begun_s(pair, Phase.HOLD) - begun_s(pair, Phase.TRACK) < 2.8
 
 
+def thinned(rate_hz: float, loss: float = 0.0) -> Any:
+    """Return a scenario in which each message arrives at this rate, from 5 s after engaging."""
+    slow = {"fault": "link", "direction": "down", "message_rate_hz": rate_hz, "loss": loss}
+    return scenario_of({**slow, "jitter_s": 0.02, "after": "engaged", "at_s": 5.0})
+
+
 def asked_to_disarm_without_force(pair: Pair) -> None:
     assert [(m.param1, m.param2) for m in pair.commands(400)] == [(0.0, 0.0)]
     assert said(pair, "15 s without motion on the ground, and the vehicle does not disarm")
@@ -650,6 +656,14 @@ ROWS = {
         held_soon,
         fly=COPTER_HOVERS, failsafes=["uplink"], fall_mps=1.6, top_m=3.5,
         at=tracking(faults.cut(3.0, ways=["up"])),
+    ),
+    # regression: each gap was forgiven, and the tilt reached 46 deg
+    "all telemetry arrives at 3 Hz": ends(
+        "(ATTITUDE_QUATERNION|LOCAL_POSITION_NED) arrives at [23].[0-9] Hz, at least 3.5 Hz",
+        landed, fly=px4.lap, failsafes=["rate"], scenario=thinned(3.0), error_m=0.5,
+    ),
+    "all telemetry arrives at 5 Hz with some losses": flies(
+        fly=px4.lap, scenario=thinned(5.0, loss=0.02), failsafes=(), error_m=0.5,
     ),
     # a missing HEARTBEAT is requested, because the next one, 3 s after the newest, is too late
     "two heartbeats are lost and no CURRENT_MODE arrives": flies(

@@ -67,7 +67,9 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
         time=SimpleNamespace(mixed=False),
         vehicle=None,
         dialect=None,
-        rates_hz={"ATTITUDE_QUATERNION": 50.0, "LOCAL_POSITION_NED": 30.0},
+        telemetry=SimpleNamespace(
+            rates_hz={"ATTITUDE_QUATERNION": 50.0, "LOCAL_POSITION_NED": 30.0}
+        ),
     )
     observer: Any = SimpleNamespace(
         hover_thrust_estimate=0.4,
