@@ -89,8 +89,9 @@ def _network_link(kind: str, host: str, port: int) -> Link:
     sock = socket.socket(family, socket.SOCK_STREAM) if kind == "tcpin" else udp_socket(family)
     try:
         if kind == "udpout":
-            sock.connect(place)
-            return UdpLink(None, sock)
+            with udp_socket(family) as probe:  # sends nothing
+                probe.connect(place)  # fails without a route, and replaces 0.0.0.0 by this computer
+                return UdpLink(sock, None, probe.getpeername())
         if kind == "udpin":
             sock.bind(place)
             return UdpLink(sock, None)

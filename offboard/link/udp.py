@@ -1,4 +1,6 @@
-"""UDP links. Once the vehicle is known, a second socket on the same local port is connected to it.
+"""UDP links. Once the vehicle is known, a second socket on the same local port is connected to it,
+and only receives. Frames are sent by the socket that is not connected, because a connected one
+keeps its source address when this computer gets another one (DHCP).
 
 Linux lets two sockets share a port with SO_REUSEADDR, macOS with SO_REUSEPORT. The option is
 cleared afterwards, so that no other program can share the port.
@@ -90,13 +92,19 @@ def _stamp_s(ancillary: list[tuple[int, int, bytes]]) -> float:
 
 class UdpLink(Link):
     """A UDP link. The socket `listening` receives from every sender; `vehicle` is connected to the
-    vehicle. One of them may be None."""
+    vehicle. One of them may be None. Without `vehicle`, `peer` is the only address that is heard;
+    None: every one."""
 
-    def __init__(self, listening: socket.socket | None, vehicle: socket.socket | None) -> None:
+    def __init__(
+        self,
+        listening: socket.socket | None,
+        vehicle: socket.socket | None,
+        peer: Hashable | None = None,
+    ) -> None:
         super().__init__()
         self._listening = _Inbox(listening) if listening else None
         self._vehicle = _Inbox(vehicle) if vehicle else None
-        self._peer: Hashable = vehicle.getpeername() if vehicle else None
+        self._peer: Hashable = vehicle.getpeername() if vehicle else peer
         self._heard_s = clock.monotonic_s()  # when a datagram of the vehicle was last read
         # `_beside`: ports that have sent while the vehicle did, and host times until which they are
         # other senders; `_newer`: ports heard since its last datagram
@@ -116,7 +124,8 @@ class UdpLink(Link):
         chunks = self._vehicle.drain(BATCH_MAX) if self._vehicle else []
         if self._listening:
             if self._vehicle is None:
-                return self._listening.drain(BATCH_MAX)
+                heard = self._listening.drain(BATCH_MAX)
+                return [chunk for chunk in heard if self._peer in (None, chunk.peer)]
             if len(chunks) < BATCH_MAX:
                 chunks += self._look(self._listening, bool(chunks))
             else:  # the vehicle's socket may hold more, older than what others have sent
@@ -159,14 +168,11 @@ class UdpLink(Link):
     # --- out ---
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
+        place = self._peer or peer
         with suppress(OSError):  # the flight notices a broken link as silence
-            if self._vehicle is None:
-                if self._listening and isinstance(peer, tuple):
-                    self._listening.socket.sendto(data, peer)
-                return
-            try:
-                self._vehicle.socket.send(data)
-            except ConnectionError:  # it reports an earlier ICMP error, and has sent nothing
+            if self._listening and isinstance(place, tuple):
+                self._listening.socket.sendto(data, place)
+            elif self._vehicle:
                 self._vehicle.socket.send(data)
 
     # --- the vehicle ---
