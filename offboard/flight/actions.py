@@ -160,12 +160,13 @@ def _stand_by(flight: FlightState, time_s: float) -> None:
     """Stream setpoints that change nothing, because PX4 accepts OFFBOARD only while setpoints
     arrive: on the ground without thrust, in the air with the vehicle's own attitude and thrust.
     Send none in the air in a failsafe or just after it, because PX4 would return to OFFBOARD by
-    itself, none while another program sends setpoints, and none on old telemetry."""
+    itself, none while another program sends setpoints, and none on old telemetry or just after the
+    vehicle was disarmed."""
     on_ground, vehicle = flight.contact.on_ground, flight.vehicle
     command = Command(0.0, LEVEL_DIRECTION, vehicle.heading_rad) if on_ground else _flown(flight)
     quiet = bool(flight.takes_off_by_command or telemetry_old(flight) or other_sender(flight))
     if on_ground:
-        quiet |= vehicle.armed and vehicle.in_failsafe
+        quiet |= vehicle.disarmed_lately or (vehicle.armed and vehicle.in_failsafe)
     else:
         quiet |= vehicle.in_failsafe or flight.pilot is not PilotSwitch.READY
     if quiet:

@@ -240,7 +240,7 @@ def other_sender(ground: Ground) -> str:
 
 
 def _same_system_id(ground: Ground) -> str:
-    if not ground.session.time.mixed:
+    if not (ground.session.time.mixed or ground.vehicle.arming_alternates):
         return ""
     return (
         "two vehicles with the same system id send on this link, or its telemetry comes twice, "
@@ -253,10 +253,20 @@ def twin(ground: Ground) -> str:
     return ground.session.senders.twin(ground.session.link_time_s)
 
 
+def same_ids(ground: Ground) -> str:
+    """Two vehicles with the same system id are heard."""
+    return _same_system_id(ground) or twin(ground)
+
+
 def other_vehicle(ground: Ground) -> str:
     """Several vehicles are heard and none was chosen with --system, or two of them have the same
     system id."""
-    return _same_system_id(ground) or _several_vehicles(ground)
+    return same_ids(ground) or _several_vehicles(ground)
+
+
+def signs(ground: Ground) -> str:
+    """The vehicle has a key, and ignores our messages, which are not signed."""
+    return senders.SIGNS if ground.session.senders.signs else ""
 
 
 def _no_telemetry(ground: Ground) -> str:
@@ -433,6 +443,7 @@ PREFLIGHT = (
     Row("senders", BLOCKS, _several_vehicles, _CHOOSE, at_once=True),
     Row("senders", BLOCKS, _same_system_id, _SAME_ID, at_once=True),
     Row("senders", BLOCKS, twin, _ONE_WAY),
+    Row("senders", BLOCKS, signs, senders.GIVE_KEY),
     Row("rates", WAIT, _no_telemetry, _remedy),
     Row("supervisor", WAIT, _unguarded),
     Row("rates", BLOCKS, _slow, "{ground.known_dialect.slow_hint}"),

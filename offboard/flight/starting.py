@@ -19,7 +19,7 @@ from offboard.flight.conditions import (
     stop_requested,
 )
 from offboard.flight.phases import ExitCode, Phase, Request
-from offboard.flight.preflight import armed_already, other_sender, other_vehicle, twin, unfit_type
+from offboard.flight.preflight import armed_already, other_sender, other_vehicle, unfit_type
 from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, DISARMED_S
 from offboard.mavlink.events import Heartbeat
@@ -83,6 +83,12 @@ def not_ready(flight: FlightState) -> str:
 
 
 PREVENTED = other_sender, mode_unknown, silent, blind  # they prevent a take-over
+
+
+def not_for_this_vehicle(flight: FlightState) -> str:
+    """Why setpoints of STANDBY may act on another vehicle, be made from the attitude of another
+    one, or not be accepted. In HEALTH none is sent."""
+    return preflight.same_ids(flight) or preflight.signs(flight)
 
 
 def firmware_unknown(flight: FlightState) -> bool:
@@ -274,6 +280,7 @@ SERVICE_BEGINS = (
     Transition({STANDBY}, engaged_by_pilot, CLIMB, FLOWN),
     Transition({HEALTH, STANDBY}, engaged_but_unfit, HAND_BACK, REFUSED),
     Transition({HEALTH, STANDBY}, stop_requested, FAILED, FLOWN, OPERATOR),
+    Transition({STANDBY}, not_for_this_vehicle, HEALTH),
     Transition({HEALTH}, usable, STANDBY, reason="telemetry flows"),
     Transition({STANDBY}, engaged_too_soon, HAND_BACK, REFUSED, reason=TOO_SOON),
     Transition({STANDBY}, started_in_the_air, CLIMB, FLOWN),
@@ -287,7 +294,6 @@ STARTING = (
     Transition(STREAMING, stop_requested, FAILED, REFUSED, OPERATOR, BEFORE_TAKEOFF),
     Transition(STREAMING, other_sender, FAILED, REFUSED, "second sender"),
     Transition(STREAMING, other_vehicle, FAILED, REFUSED),
-    Transition(STREAMING, twin, FAILED, REFUSED),
     Transition(STREAMING, blind, FAILED, REFUSED, "link"),
     Transition(STREAMING, mode_unknown, FAILED, REFUSED, "link"),
     Transition(STREAMING, authority_lost, FAILED, REFUSED, "mode change"),

@@ -43,6 +43,8 @@ DISARMED_S = 1.5  # longer than the period of HEARTBEAT, in which arming may hav
 ARMED_KNOWN_S = 3.0  # age up to which a HEARTBEAT counts; only it shows whether PX4 is armed
 REPEATED_S = 0.05  # PX4 and ArduCopter repeat a component of the position for 0.03 s at most
 OUTAGE_S = 0.3  # a longer gap of all telemetry is an outage of the link
+# Nobody arms and disarms so often: HEARTBEATs of two vehicles alternate
+ARMINGS, ARMINGS_S = 4, 10.0
 OTHER_SENDER_S = 5.0  # a second sender counts as present for this time after its newest frame
 MESSAGES_MAX = 12  # texts and refusals kept for the sentence that explains a failure
 # MAV_CMD SET_MESSAGE_INTERVAL, REQUEST_MESSAGE: their refusal explains no failure
@@ -69,7 +71,10 @@ class VehicleState:
     mode: str = "unknown"
     other_sender: OtherSender | None = None
     other_companion: OtherCompanion | None = None
-    armed_changed_s: float = -math.inf  # link time; -inf until it was first seen armed
+    # link times at which arming was seen to change, the newest last; -inf before the first
+    armings_s: deque[float] = field(
+        default_factory=lambda: deque([-math.inf] * ARMINGS, maxlen=ARMINGS)
+    )
     resumed_s: float = -math.inf  # vehicle time of the first telemetry after an outage
     # when an EstimatorReport last showed other horizontal ratios, and how often one did
     measured_s: float = -math.inf
@@ -114,7 +119,7 @@ class VehicleState:
     def disarmed_s(self) -> float:
         """Time since the vehicle was first reported disarmed; 0 while it is armed, infinite if it
         was never seen armed."""
-        return 0.0 if self.armed else self.now_s - self.armed_changed_s
+        return 0.0 if self.armed else self.now_s - self.armings_s[-1]
 
     def age_s(self, kind: type) -> float:
         """Time since the newest event of this type; infinite if none was heard."""
@@ -123,6 +128,17 @@ class VehicleState:
     @property
     def armed(self) -> bool:
         return self.heartbeat is not None and self.heartbeat.armed
+
+    @property
+    def arming_alternates(self) -> bool:
+        """Whether HEARTBEATs show the vehicle armed and disarmed in turn."""
+        return self.now_s - self.armings_s[0] < ARMINGS_S
+
+    @property
+    def disarmed_lately(self) -> bool:
+        """Whether the vehicle was armed, and shown disarmed, within ARMINGS_S: it may fly, and
+        another vehicle be disarmed."""
+        return self.now_s - self.armings_s[-2 if self.armed else -1] < ARMINGS_S
 
     @property
     def disarmed(self) -> bool:
@@ -184,7 +200,7 @@ class VehicleState:
         """Store what one event reports. Returns False if it repeats an earlier event of its kind,
         which makes it no measurement."""
         self.now_s = now_s
-        if self._repeats(event) and math.isfinite(self.armed_changed_s):
+        if self._repeats(event) and math.isfinite(self.armings_s[-1]):
             return False
         self.heard_s[type(event)] = now_s
         if isinstance(event, (LocalPosition, Attitude)):
@@ -192,7 +208,7 @@ class VehicleState:
         match event:
             case Heartbeat(mode, armed):
                 if armed != self.armed:
-                    self.armed_changed_s = now_s
+                    self.armings_s.append(now_s)
                 self.heartbeat, self.mode = event, mode
             case ModeReport(mode):
                 self.mode = mode

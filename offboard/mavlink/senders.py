@@ -51,6 +51,7 @@ COMMANDS = COMMAND_INT, COMMAND_LONG = 75, 76
 _MODE_COMMANDS = frozenset({20, 21, 22, 176, 192, 300, 400})
 PEER_SILENT_S = 0.5  # half of `Limits.silence_s`, so that the flight can continue on a new port
 OTHER_VEHICLE_S = 5.0  # after a longer silence another vehicle may be on the link, or another host
+SIGNS, GIVE_KEY = "the vehicle signs its messages", "give its key with --signing-key"
 SYSTEMS_MAX = 8  # systems that are remembered
 HEARD_S = 10.0  # a system counts as present for this time after its newest HEARTBEAT
 NOTED_EVERY_S = 1.0  # a system is noted again only after this time
@@ -70,7 +71,8 @@ class Senders:
     `vehicle` and `dialect` are None until the vehicle was found. `own` are our ids; our system id
     is that of the vehicle. `systems` has the time at which each autopilot was heard, to a second;
     `twin_s` the time at which one with the vehicle's system id was heard from another address.
-    `forged` counts the frames that signing refused. `roams`: whether the vehicle may now send from
+    `forged` counts the frames that signing refused. `signs`: whether the newest HEARTBEAT of an
+    autopilot was signed although we have no key. `roams`: whether the vehicle may now send from
     another host. Times are `Session.link_time_s`, except
     `newest_frame_s`: `Session.elapsed_s` of the vehicle's newest frame.
     """
@@ -84,9 +86,9 @@ class Senders:
         self.systems: dict[int, float] = {}
         self.twin_s = -math.inf
         self.forged: Counter[Refusal] = Counter()
+        self.signs = False
         self.roams = False
         self._news_at = 1  # number of forged frames at which `news` reports next
-        self._signs = False  # whether an autopilot that signs was heard although we have no key
         self._other_component = 0  # newest component id of an autopilot with another one than 1
         self.newest_frame_s = 0.0
         self._wanted = wanted
@@ -174,7 +176,9 @@ class Senders:
             if self._is_companion(frame):
                 ids = frame.system_id, frame.component_id
                 events.append(OtherCompanion(*ids, frame.message.custom_mode))
-            return theirs and heard is self.dialect
+            ours = theirs and heard is self.dialect
+            self.signs = self._signs_unasked(frame) if ours else self.signs
+            return ours
         if message_id in COMMANDS:
             self._note_command(frame, events)
             return False
@@ -194,13 +198,16 @@ class Senders:
             return True  # a simulator in lockstep may need the reply before its first heartbeat
         if heard is None:
             return False
-        if frame.signed and self._signing is None:
-            self._signs = True
+        self.signs = self._signs_unasked(frame)
+        if self.signs:
             return False
         vehicle = VehicleFound(frame.system_id, frame.component_id, heard.name)
         self.set_vehicle(vehicle, peer)
         events.append(vehicle)
         return True
+
+    def _signs_unasked(self, frame: Frame) -> bool:
+        return frame.signed and self._signing is None
 
     def _note_command(self, frame: Frame, events: list[Event]) -> None:
         """Add to `events` a command to us, and a mode command from another companion computer of
@@ -288,8 +295,8 @@ class Senders:
             )
         if forged[Refusal.UNSIGNED]:
             return "frames arrive unsigned: set the key on the vehicle, or omit --signing-key"
-        if self._signs:
-            return "the vehicle signs its messages: give its key with --signing-key"
+        if self.signs:
+            return f"{SIGNS}: {GIVE_KEY}"
         if self._wanted is not None and self.systems:
             return f"system {self._wanted} is not heard, but {_listed(self.systems)}; see --system"
         if self._other_component:

@@ -78,7 +78,8 @@ def _stand(standing: Standing, armed: bool | None = None) -> Setup:
 def _disarm(flight: FlightState, for_s: float = 1.6, landed: str = "on_ground") -> None:
     heartbeat(flight, armed=False)
     hear(flight, Landed(landed))
-    flight.began_s = flight.vehicle.armed_changed_s = NOW_S - for_s
+    flight.began_s = NOW_S - for_s
+    flight.vehicle.armings_s.append(flight.began_s)
 
 
 def _engage(pilot: PilotSwitch) -> Setup:
@@ -195,7 +196,7 @@ EVENTS: dict[str, Setup] = {
     "other_vehicle": lambda flight: vars(flight.session.senders).update(
         candidates=lambda now_s: "1 and 2"
     ),
-    "twin": lambda flight: vars(flight.session.senders).update(twin=lambda now_s: "another, too"),
+    "not_for_this_vehicle": lambda flight: vars(flight.session.senders).update(signs=True),
     "disarmed": _disarm,
     "disarmed_again": _refuse_arming,
     "disarmed_for_good": _disarm,

@@ -13,7 +13,7 @@ from typing import Any
 import faults
 import numpy as np
 import pytest
-from pair import STEP_S, another_vehicle, decode
+from pair import STEP_S, another_vehicle, decode, frame_id, frames_of
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from service_wire import HOLD, Wire
 from serving import (
@@ -632,6 +632,35 @@ def test_parameters_and_uid_are_read_again_after_a_silence(served: Served) -> No
     pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
     assert said(pair, "another vehicle answers")
     assert pair.state.vehicle.uid == 1
+
+
+@pytest.mark.parametrize("kinds", [(), (faults.HEARTBEAT, faults.EXTENDED_SYS_STATE)], ids=str)
+def test_no_setpoint_is_streamed_while_two_vehicles_share_an_address(
+    served: Served, kinds: tuple[int, ...]
+) -> None:
+    """One flies; the other one, which booted earlier, stands disarmed. It sends all its telemetry,
+    or only messages of these kinds. Regression: setpoints without thrust were streamed."""
+    pair, other = served.aloft(), serve().instance
+    for _ in range(int(60.0 / STEP_S)):
+        other.step()
+    alone = pair.down
+
+    def mixed(time_s: float, datagrams: list[bytes]) -> list[bytes]:
+        frames = [frame for datagram in other.step() for frame in frames_of(datagram)]
+        others = [frame for frame in frames if not kinds or frame_id(frame) in kinds]
+        return [*alone(time_s, datagrams), *others]
+
+    pair.down, mixed_s = mixed, pair.time_s
+    pair.until(lambda: pair.phase is Phase.HEALTH, 12.0)
+    health_s = pair.time_s
+    pair.run(6.0)
+    assert min(thrusts(pair, mixed_s)) > 0.4
+    assert thrusts(pair, health_s + 0.1) == []
+    assert said(pair, "health: two vehicles with the same system id send on this link")
+    pair.down = alone
+    pair.run(20.0)
+    assert pair.phase is Phase.STANDBY
+    assert min(thrusts(pair, pair.time_s - 0.5)) > 0.4
 
 
 def test_vehicle_without_copter_parameters_is_left_alone(served: Served) -> None:

@@ -130,3 +130,12 @@ def test_vehicle_with_old_stamps_after_a_reboot_is_heard() -> None:
         assert not pair.companion.has_ended(), pair.companion.outcome
         pair.advance()
     assert pair.companion.session.senders.forged.total() > 0
+
+
+def test_vehicle_that_has_just_been_given_a_key_is_refused_with_that_reason() -> None:
+    """Regression: only that no TIMESYNC request was answered was said."""
+    pair = hover(limits={"health_s": 8.0})
+    pair.at.append((in_phase(Phase.HEALTH, 0.1), lambda p: p.instance.keyring.set_up(KEY, 1)))
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.REFUSED
+    assert "signs its messages. Fix: give its key with --signing-key" in outcome.sentence

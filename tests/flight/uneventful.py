@@ -61,6 +61,7 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
             candidates=lambda now_s: "",
             twin=lambda now_s: "",
             why_none=lambda: "",
+            signs=False,
             forged=Counter[Any](),
         ),
         link_time_s=NOW_S,
