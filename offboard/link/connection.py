@@ -89,12 +89,13 @@ def _network_link(kind: str, host: str, port: int) -> Link:
     sock = socket.socket(family, socket.SOCK_STREAM) if kind == "tcpin" else udp_socket(family)
     try:
         if kind == "udpout":
+            sock.bind(("", 0))
             with udp_socket(family) as probe:  # sends nothing
                 probe.connect(place)  # fails without a route, and replaces 0.0.0.0 by this computer
-                return UdpLink(sock, None, probe.getpeername())
+                return UdpLink(sock, peer=probe.getpeername())
         if kind == "udpin":
             sock.bind(place)
-            return UdpLink(sock, None)
+            return UdpLink(sock)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind(place)
         sock.listen()

@@ -72,9 +72,10 @@ class LinkReport:
 class Link:
     """Non-blocking byte channel. `is_stream`: whether a received chunk may end within a frame.
     `capacity_bytes_ps`: capacity of each direction in bytes per second; None: unknown. `opened`: a
-    counter that changes whenever the descriptors change."""
+    counter that changes whenever the descriptors change. `listens`: whether the first of
+    `descriptors` is a listening socket, which also hears others."""
 
-    is_stream = False
+    is_stream = listens = False
     opened = 0
     capacity_bytes_ps: float | None = None
 
@@ -99,11 +100,6 @@ class Link:
     def descriptors(self) -> tuple[int, ...]:
         """The open file descriptors. With them another process can continue the link."""
         return ()
-
-    @property
-    def listens(self) -> bool:
-        """Whether the first of `descriptors` is a listening socket, which also hears others."""
-        return False
 
     def close(self) -> None:
         """Close all descriptors."""

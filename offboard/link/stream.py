@@ -248,6 +248,8 @@ class RedialingLink(StreamLink):
 class ListeningLink(StreamLink):
     """Accepts one client at a time on `listening`, as the README says."""
 
+    listens = True
+
     def __init__(self, listening: socket.socket, name: str, stream: Stream | None = None) -> None:
         super().__init__(stream, name)
         listening.setblocking(False)
@@ -271,10 +273,6 @@ class ListeningLink(StreamLink):
 
     def descriptors(self) -> tuple[int, ...]:
         return (self._listening.fileno(), *super().descriptors())
-
-    @property
-    def listens(self) -> bool:
-        return True
 
     def close(self) -> None:
         super().close()

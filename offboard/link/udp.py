@@ -1,6 +1,5 @@
 """UDP links. Once the vehicle is known, a second socket on the same local port is connected to it,
-and only receives. Frames are sent by the socket that is not connected, because a connected one
-keeps its source address when this computer gets another one (DHCP).
+and only receives.
 
 Linux lets two sockets share a port with SO_REUSEADDR, macOS with SO_REUSEPORT. The option is
 cleared afterwards, so that no other program can share the port.
@@ -92,17 +91,19 @@ def _stamp_s(ancillary: list[tuple[int, int, bytes]]) -> float:
 
 class UdpLink(Link):
     """A UDP link. The socket `listening` receives from every sender; `vehicle` is connected to the
-    vehicle. One of them may be None. Without `vehicle`, `peer` is the only address that is heard;
-    None: every one."""
+    vehicle, or None. Without `vehicle`, `peer` is the only address that is heard; None: every one.
+    """
+
+    listens = True
 
     def __init__(
         self,
-        listening: socket.socket | None,
-        vehicle: socket.socket | None,
+        listening: socket.socket,
+        vehicle: socket.socket | None = None,
         peer: Hashable | None = None,
     ) -> None:
         super().__init__()
-        self._listening = _Inbox(listening) if listening else None
+        self._listening = _Inbox(listening)
         self._vehicle = _Inbox(vehicle) if vehicle else None
         self._peer: Hashable = vehicle.getpeername() if vehicle else peer
         self._heard_s = clock.monotonic_s()  # when a datagram of the vehicle was last read
@@ -121,18 +122,17 @@ class UdpLink(Link):
         select.select([i.socket for i in awaited if i], [], [], max(0.0, timeout_s))
 
     def receive(self) -> list[Chunk]:
-        chunks = self._vehicle.drain(BATCH_MAX) if self._vehicle else []
-        if self._listening:
-            if self._vehicle is None:
-                heard = self._listening.drain(BATCH_MAX)
-                return [chunk for chunk in heard if self._peer in (None, chunk.peer)]
-            if len(chunks) < BATCH_MAX:
-                chunks += self._look(self._listening, bool(chunks))
-            else:  # the vehicle's socket may hold more, older than what others have sent
-                self._heard_s = clock.monotonic_s()
+        if self._vehicle is None:
+            heard = self._listening.drain(BATCH_MAX)
+            return [chunk for chunk in heard if self._peer in (None, chunk.peer)]
+        chunks = self._vehicle.drain(BATCH_MAX)
+        if len(chunks) < BATCH_MAX:
+            chunks += self._look(bool(chunks))
+        else:  # the vehicle's socket may hold more, older than what others have sent
+            self._heard_s = clock.monotonic_s()
         return sorted(chunks, key=lambda chunk: chunk.arrived_s)
 
-    def _look(self, listening: _Inbox, heard: bool) -> list[Chunk]:
+    def _look(self, heard: bool) -> list[Chunk]:
         """Read the listening socket. `heard`: whether the vehicle's own socket had datagrams.
 
         Datagrams of other senders are counted, and returned only if they may come from a new port
@@ -140,7 +140,7 @@ class UdpLink(Link):
         to a broadcast address.
         """
         now_s = clock.monotonic_s()
-        found = listening.drain(LOOK_MAX) if now_s >= self._look_s else []
+        found = self._listening.drain(LOOK_MAX) if now_s >= self._look_s else []
         ours = [chunk for chunk in found if chunk.peer == self._peer]
         others = [chunk for chunk in found if chunk.peer != self._peer]
         silent_s = now_s - self._heard_s
@@ -169,36 +169,25 @@ class UdpLink(Link):
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
         place = self._peer or peer
-        with suppress(OSError):  # the flight notices a broken link as silence
-            if self._listening and isinstance(place, tuple):
+        if isinstance(place, tuple):
+            with suppress(OSError):  # the flight notices a broken link as silence
                 self._listening.socket.sendto(data, place)
-            elif self._vehicle:
-                self._vehicle.socket.send(data)
 
     # --- the vehicle ---
 
     def follow(self, peer: Hashable) -> None:
-        if self._listening is None or peer == self._peer or not isinstance(peer, tuple):
+        if peer == self._peer or not isinstance(peer, tuple):
             return
-        listening = self._listening
         before, self._vehicle = self._vehicle, None
         if before:  # the supervisor still has it, with the port
             before.socket.setsockopt(socket.SOL_SOCKET, _SHARE_PORT, 1)
             before.socket.close()
-        try:
-            sock = _second_socket(listening.socket, peer)
-        except OSError:  # then connect the only socket, and hear no other sender
-            with suppress(OSError):
-                listening.socket.connect(peer)
-            self._listening, sock = None, listening.socket
-        self._vehicle, self._peer = _Inbox(sock), peer
+        with suppress(OSError):  # else no other sender is heard
+            self._vehicle = _Inbox(_second_socket(self._listening.socket, peer))
+        self._peer = peer
         self._newer.clear()
         self.opened += 1
         self._heard_s = clock.monotonic_s()
-
-    @property
-    def listens(self) -> bool:
-        return self._listening is not None
 
     def descriptors(self) -> tuple[int, ...]:
         return tuple(i.socket.fileno() for i in (self._listening, self._vehicle) if i)
@@ -237,7 +226,7 @@ class LockstepLink(UdpLink):
     """
 
     def __init__(self, sock: socket.socket) -> None:
-        super().__init__(sock, None)
+        super().__init__(sock)
         self.port: int = sock.getsockname()[1]
         self._block: list[Chunk] = []  # datagrams since the newest barrier
         self._barrier = b""

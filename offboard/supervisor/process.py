@@ -192,10 +192,10 @@ def _link(descriptors: list[int], stream: str, *, listens: bool) -> Link:
     """Return the link that has these descriptors. `stream`: the name of a stream, empty for UDP.
     `listens`: whether the first descriptor listens for others than the vehicle. Without another one
     nothing can be sent to the vehicle until it connects again."""
+    if not stream:
+        return UdpLink(*(socket.socket(fileno=each) for each in descriptors))
     listening = socket.socket(fileno=descriptors[0]) if listens else None
     vehicle = descriptors[listens] if len(descriptors) > listens else None
-    if not stream:
-        return UdpLink(listening, None if vehicle is None else socket.socket(fileno=vehicle))
     begun = None if vehicle is None else Stream(vehicle, partial(os.close, vehicle))
     return ListeningLink(listening, stream, begun) if listening else StreamLink(begun, stream)
 
