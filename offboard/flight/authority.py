@@ -28,7 +28,7 @@ class Standing(Enum):
     """Whether the vehicle is ours, according to the sequence of the modes that it has reported."""
 
     FREE = "not asked for yet"
-    ASKED = "asked for"
+    ASKED = "asked for, or about to be"
     OURS = "follows our setpoints"
     FAILSAFE = "in the failsafe for setpoints that did not arrive"
     HANDED = "in a mode that we asked for as the end of the flight"
@@ -63,7 +63,7 @@ class Authority:
     lost_s: float = math.inf  # time of the loss; -inf if a HEARTBEAT reported it
     setpoint_loss: SetpointLoss = NEVER  # what the autopilot does without setpoints
     arrived_s: float = -math.inf  # host time of the arrival of the newest report
-    _asked_in: str = ""  # the mode reported when we requested `engage_mode`
+    _asked_in: str = ""  # the mode reported when `ask` was called
     # modes that we requested to end the flight, oldest first; when the vehicle shows one of them,
     # those requested before it are dropped
     _requested: list[str] = field(default_factory=list)
@@ -99,9 +99,7 @@ class Authority:
             if mode == self.engage_mode:
                 self.standing = Standing.OURS
             elif mode != self._asked_in:
-                self.lose(
-                    f"it showed {mode} after {self.engage_mode} was asked for", now_s, heartbeat
-                )
+                self.lose(f"{mode} was selected before {self.engage_mode}", now_s, heartbeat)
         elif self.standing in (Standing.OURS, Standing.FAILSAFE):
             if mode == self.engage_mode:  # PX4 returns to it when setpoints arrive again
                 self.standing = Standing.OURS
@@ -158,7 +156,7 @@ class Authority:
         )
 
     def ask(self) -> None:
-        """Note that we request the mode in which the vehicle follows our setpoints."""
+        """Note that we request, now or after a stream of setpoints, the mode that follows them."""
         if self.standing is Standing.FREE:
             self._asked_in = self.mode
             already = self.mode == self.engage_mode

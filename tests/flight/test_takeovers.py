@@ -15,7 +15,7 @@ from collections.abc import Callable
 import pytest
 from faults import CURRENT_MODE, HEARTBEAT, losing, without
 from pair import Pair, decode, frame_id, frames_of, in_phase, level_setpoint
-from watch import SET_MESSAGE_INTERVAL, Vehicle, aborted, begun_s, copter, px4
+from watch import SET_MESSAGE_INTERVAL, Vehicle, aborted, begun_s, copter, px4, refused
 
 from offboard.flight.authority import Standing
 from offboard.flight.phases import ENDS, ExitCode, Phase
@@ -120,6 +120,15 @@ def test_nothing_is_sent_after_a_pilot_takes_over(seed: int) -> None:
     assert judge.wrong == []
     if judge.gone_s is not None and acted:
         assert pair.companion.authority.standing is Standing.LOST or mode is None
+
+
+def test_mode_that_a_pilot_selects_while_setpoints_stream_is_kept() -> None:
+    """Regression: within the second before its request, the vehicle was engaged and armed."""
+    pair = px4.hop()
+    switch = pair.instance.autopilot.commander.switch
+    pair.at.append((in_phase(Phase.STREAM, 0.5), lambda _: switch("POSCTL")))
+    refused(pair, "POSCTL was selected before OFFBOARD")
+    assert (pair.modes, pair.armings, pair.mode) == ([], [], "POSCTL")
 
 
 def test_hold_requested_on_the_ground_is_requested_again_in_flight() -> None:
