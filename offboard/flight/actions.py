@@ -16,8 +16,6 @@ from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command
 
 HEARTBEAT, AUTOPILOT_VERSION = 0, 148  # message ids
-# PX4 sends HEARTBEAT at 1 Hz. A link that loses several may lose all reports of mode and arming;
-# without CURRENT_MODE (PX4 1.14), a pilot might leave the mode and return between two of them
 HEARTBEAT_DUE_S, HEARTBEAT_ALONE_DUE_S, HEARTBEAT_EVERY_S = 1.3, 0.2, 0.15
 MODE_REPORTED_S = 3.0  # PX4 1.15 sends CURRENT_MODE twice a second, and when it changes
 FIT_EVERY_S = 4.0  # between two reductions of the telemetry: a backlog must drain first

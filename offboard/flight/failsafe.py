@@ -185,10 +185,7 @@ def no_thrust_reserve(flight: FlightState) -> str:
 
 
 def sinks_with_full_thrust(flight: FlightState) -> str:
-    """Downward speed while the newest setpoint demands full thrust.
-
-    The age of the position and missing setpoints need no check here: the rows "blind" and
-    "decisions" act on them."""
+    """Downward speed while the newest setpoint demands full thrust."""
     position, thrusts = flight.vehicle.position, flight.thrusts
     if flight.phase not in TRACKING or position is None or not thrusts:
         return ""

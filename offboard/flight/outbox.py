@@ -72,8 +72,7 @@ def admit(
         late_s: time by which the setpoint is ready later than one control period after the arrival
             of its telemetry; not positive if it is ready in time.
 
-    Raises Refused if the vehicle is not ours, the telemetry was too old, the decision too late, or
-    a value cannot be sent.
+    Raises Refused.
     """
     if not ours:
         raise Refused(Refusal.NOT_OURS, "the vehicle is not ours")
@@ -223,15 +222,8 @@ def hover_mps2(flight: FlightState) -> float:
 
 
 def request(flight: FlightState, request: CommandLong) -> bool:
-    """Send a command if `Authority.permits_command`. Returns whether it was sent.
-
-    Each command is sent once in a phase. It is sent again only if it was refused or not answered,
-    REPEAT_S after it was sent, and if the vehicle has reported its mode since then, because a pilot
-    may have changed it. The link may be late in both directions. Therefore a report counts only if
-    it arrives after the reply to the TIMESYNC request that was sent with the command, or to a later
-    one. Without telemetry for a second, or without such a reply for ANSWERS_S, every later report
-    counts.
-    """
+    """Send a command if `Authority.permits_command`, once in a phase, and again under the
+    conditions of README.md ("A request is sent once"). Returns whether it was sent."""
     result = flight.vehicle.results.get(request.command)
     requested_s, host_s = flight.requested_s.get(request, NEVER)
     waits = flight.now_s - requested_s < REPEAT_S - 1e-6 or flight.authority.report_s < requested_s

@@ -118,7 +118,7 @@ class ServiceOptions:
 
 
 class Limits(Parameters):
-    """Limits of a flight, in SI units. Seconds are link time (see `state`), but `connect_s` and
+    """Limits of a flight, in SI units. Seconds are link time (README.md), but `connect_s` and
     `silence_s` are host time (in lockstep simulated time), and `blind_s`, ages and delays are
     vehicle time. `failsafe` defines what happens when a
     limit is exceeded in flight. The class variables are not settings, because no vehicle, link or

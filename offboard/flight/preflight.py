@@ -253,15 +253,10 @@ def twin(ground: Ground) -> str:
     return ground.session.senders.twin(ground.session.link_time_s)
 
 
-def same_ids(ground: Ground) -> str:
-    """Two vehicles with the same system id are heard."""
-    return _same_system_id(ground) or twin(ground)
-
-
 def other_vehicle(ground: Ground) -> str:
     """Several vehicles are heard and none was chosen with --system, or two of them have the same
     system id."""
-    return same_ids(ground) or _several_vehicles(ground)
+    return _same_system_id(ground) or twin(ground) or _several_vehicles(ground)
 
 
 def signs(ground: Ground) -> str:

@@ -88,7 +88,7 @@ PREVENTED = other_sender, mode_unknown, silent, blind  # they prevent a take-ove
 def not_for_this_vehicle(flight: FlightState) -> str:
     """Why setpoints of STANDBY may act on another vehicle, be made from the attitude of another
     one, or not be accepted. In HEALTH none is sent."""
-    return preflight.same_ids(flight) or preflight.signs(flight)
+    return other_vehicle(flight) or preflight.signs(flight)
 
 
 def firmware_unknown(flight: FlightState) -> bool:

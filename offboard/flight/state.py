@@ -2,9 +2,8 @@
 the other modules take it as an argument.
 
 `VehicleState`, `Authority`, `GroundContact` and `VehicleClock` hold what was received, with its
-time. `transitions` and `failsafe` decide what follows from it. There are three times: vehicle time
-(`time_boot_ms`), host time (`Session.elapsed_s`, which in lockstep is simulated time) and link time
-(`Session.link_time_s`, which follows vehicle time, or host time while telemetry is missing).
+time. `transitions` and `failsafe` decide what follows from it. README.md defines
+vehicle time, host time (`Session.elapsed_s`) and link time (`Session.link_time_s`).
 """
 
 from __future__ import annotations

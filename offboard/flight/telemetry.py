@@ -1,8 +1,6 @@
 """What each received message changes in a flight. Only replies and announcements are sent.
 
-In the service, a ground station may send these commands to our component: MAV_CMD_MISSION_START
-starts the reference, MAV_CMD_DO_PAUSE_CONTINUE pauses and continues it, and MAV_CMD_DO_SET_MODE,
-with any parameters, hands the vehicle back.
+`offboard/service/README.md` lists the commands of a ground station to our component.
 """
 
 from __future__ import annotations

@@ -203,9 +203,6 @@ def _begin_health(flight: FlightState, source: Phase) -> None:
 def _begin_stream(flight: FlightState, source: Phase) -> None:
     # from now on another mode is a pilot's; a vehicle that shows OFFBOARD already gets no request
     flight.authority.ask()
-
-
-def _begin_engage(flight: FlightState, source: Phase) -> None:
     _set_hover_thrust(flight)
 
 
@@ -273,7 +270,6 @@ def _begin_climb(flight: FlightState, source: Phase) -> None:
 BEGINS: Mapping[Phase, Callable[[FlightState, Phase], None]] = {
     Phase.HEALTH: _begin_health,
     Phase.STREAM: _begin_stream,
-    Phase.ENGAGE: _begin_engage,
     Phase.TAKEOFF: _begin_takeoff,
     Phase.CLIMB: _begin_climb,
     Phase.JOIN: _begin_join,

@@ -4,10 +4,6 @@ The first autopilot heard is the vehicle, identified by system id, component id 
 From then on other senders are ignored, and with a key all frames without its signature. Setpoints
 and mode commands that another sender sends to our vehicle, and other companion computers, are
 reported.
-
-After a restart mavlink-router and MAVProxy send from another port. Therefore another port of the
-same host becomes the vehicle's address if it sends the vehicle's frames after a silence (see
-`link.udp`), and before a flight also another host.
 """
 
 from __future__ import annotations
@@ -177,7 +173,8 @@ class Senders:
                 ids = frame.system_id, frame.component_id
                 events.append(OtherCompanion(*ids, frame.message.custom_mode))
             ours = theirs and heard is self.dialect
-            self.signs = self._signs_unasked(frame) if ours else self.signs
+            if ours:
+                self.signs = frame.signed and self._signing is None
             return ours
         if message_id in COMMANDS:
             self._note_command(frame, events)
@@ -198,16 +195,13 @@ class Senders:
             return True  # a simulator in lockstep may need the reply before its first heartbeat
         if heard is None:
             return False
-        self.signs = self._signs_unasked(frame)
+        self.signs = frame.signed and self._signing is None
         if self.signs:
             return False
         vehicle = VehicleFound(frame.system_id, frame.component_id, heard.name)
         self.set_vehicle(vehicle, peer)
         events.append(vehicle)
         return True
-
-    def _signs_unasked(self, frame: Frame) -> bool:
-        return frame.signed and self._signing is None
 
     def _note_command(self, frame: Frame, events: list[Event]) -> None:
         """Add to `events` a command to us, and a mode command from another companion computer of
