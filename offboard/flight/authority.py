@@ -3,11 +3,7 @@
 The vehicle is ours from the moment when it reports the mode that we requested until it reports
 another mode that we did not request. This loss is final: a mode that a pilot, a ground station or a
 failsafe has chosen is never changed. No setpoint or command is sent without a recent report.
-
-The exception is the mode of the autopilot's own failsafe for missing setpoints, which nobody chose:
-from this mode land may be requested, unless the vehicle receives a pilot's sticks.
-
-While the vehicle is not ours, `PilotSwitch` says whether the pilot has engaged the service.
+The exception, the autopilot's own failsafe for missing setpoints, is in README.md.
 """
 
 from __future__ import annotations

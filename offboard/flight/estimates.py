@@ -7,9 +7,7 @@ report a valid position for 5 to 7 s more; but the innovation ratios of their es
 exactly. Only what was there at the beginning can be lost, because a vehicle may fly by motion
 capture or optical flow, without GPS.
 
-Jumps are resets of the vehicle's estimator. They are found without a message about them
-(ODOMETRY.reset_counter exists on PX4 only): two positions some milliseconds apart that are too far
-from each other for any motion show a jump.
+Jumps are found from the positions: ODOMETRY.reset_counter, which reports them, exists on PX4 only.
 
 Before our setpoints replace the autopilot's own takeoff, or its own mode in the air, the thrust
 that it reports (ATTITUDE_TARGET) and the acceleration of the vehicle show the hover thrust,

@@ -187,8 +187,7 @@ def joined_configuration(payloads: Iterable[bytes]) -> str | None:
 
 
 class InputRecorder:
-    """Records the inputs of one `Flight`; see the module. With `kept` False it records nothing: a
-    flight of the service begins with earlier knowledge that its log does not hold."""
+    """Records the inputs of one `Flight`; see the module. With `kept` False it records nothing."""
 
     def __init__(self, settings: SessionSettings, *, kept: bool = True) -> None:
         self._kept = kept

@@ -86,8 +86,7 @@ PREVENTED = other_sender, mode_unknown, silent, blind  # they prevent a take-ove
 
 
 def not_for_this_vehicle(flight: FlightState) -> str:
-    """Why setpoints of STANDBY may act on another vehicle, be made from the attitude of another
-    one, or not be accepted. In HEALTH none is sent."""
+    """Why a setpoint may be for another vehicle, or not be accepted. In HEALTH none is sent."""
     return other_vehicle(flight) or preflight.signs(flight)
 
 

@@ -136,8 +136,7 @@ class VehicleState:
 
     @property
     def disarmed_lately(self) -> bool:
-        """Whether the vehicle was armed, and shown disarmed, within ARMINGS_S: it may fly, and
-        another vehicle be disarmed."""
+        """Whether it was disarmed within ARMINGS_S: it may fly, and another vehicle be disarmed."""
         return self.now_s - self.armings_s[-2 if self.armed else -1] < ARMINGS_S
 
     @property

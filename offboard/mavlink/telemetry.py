@@ -28,8 +28,7 @@ from offboard.mavlink.framing import STATUSTEXT, Frame
 from offboard.mavlink.texts import TextAssembler
 from offboard.mavlink.vehicle_time import Age, VehicleTime
 
-# A link may delay single frames. A report of the mode is dropped if it was sent before another one
-# that arrived less than this time ago. HEARTBEAT comes at 1 Hz.
+# A report of the mode is dropped if it was sent before one that arrived less than this time ago
 _REORDERED_S = 1.3
 _HALF_TURN = 128  # a sequence number that is this far ahead or more is taken as behind
 _GAP_S = 0.25  # after this time without any frame, half a turn may have been lost

@@ -190,8 +190,7 @@ def _known(vehicle: Mapping[str, Any], setpoint_loss: Mapping[str, Any], **more:
 
 def _link(descriptors: list[int], stream: str, *, listens: bool) -> Link:
     """Return the link that has these descriptors. `stream`: the name of a stream, empty for UDP.
-    `listens`: whether the first descriptor listens for others than the vehicle. Without another one
-    nothing can be sent to the vehicle until it connects again."""
+    `listens`: whether the first descriptor of a stream listens for clients."""
     if not stream:
         return UdpLink(*(socket.socket(fileno=each) for each in descriptors))
     listening = socket.socket(fileno=descriptors[0]) if listens else None
