@@ -90,9 +90,8 @@ def _stamp_s(ancillary: list[tuple[int, int, bytes]]) -> float:
 
 
 class UdpLink(Link):
-    """A UDP link. The socket `listening` receives from every sender; `vehicle` is connected to the
-    vehicle, or None. Without `vehicle`, `peer` is the only address that is heard; None: every one.
-    """
+    """A UDP link. The socket `listening` receives from every sender, and sends; `vehicle`, if
+    given, is connected to the vehicle. Without it, `peer`, if given, is all that is heard."""
 
     listens = True
 
