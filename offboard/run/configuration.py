@@ -37,7 +37,8 @@ Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 UNKNOWN_VEHICLE = "neutral"
 PERIODS_LEAST = 3  # control periods at full speed: two decisions, and one that may be lost
-DESCENT_MPS = 0.5  # slowest default near the ground: ArduCopter LAND_SPEED; MPC_LAND_SPEED is 0.7
+# Defaults of ArduCopter: WPNAV_SPEED_DN, LAND_ALT_LOW, LAND_SPEED; PX4 is at least as fast
+DESCENT_MPS, SLOW_BELOW_M, SLOW_MPS = 1.5, 10.0, 0.5
 
 
 class FlightConfig(Parameters):
@@ -124,12 +125,13 @@ def build_track(config: FlightConfig) -> Track:
             f"{track.track_end_s - track.track_start_s:.2g} s; a score needs {least_s:.2g} s "
             f"({PERIODS_LEAST} periods)"
         )
-    landing_s = height_m / DESCENT_MPS
+    slow_m = min(height_m, SLOW_BELOW_M)
+    landing_s = slow_m / SLOW_MPS + (height_m - slow_m) / DESCENT_MPS
     if landing_s > limits.land_s:
         raise DocumentError(
             f"reference {config.reference.title}: landing from {height_m:.4g} m takes "
-            f"{landing_s:.4g} s at {DESCENT_MPS} m/s, longer than limits.land_s "
-            f"({limits.land_s:g} s); fly lower or allow more time"
+            f"{landing_s:.4g} s, longer than limits.land_s ({limits.land_s:g} s); fly lower or "
+            "allow more time"
         )
     for reached_m, where, limit, limit_m in (
         (height_m, "above", "limits.ceiling_m", limits.ceiling_m),
