@@ -39,6 +39,7 @@ UNKNOWN_VEHICLE = "neutral"
 PERIODS_LEAST = 3  # control periods at full speed: two decisions, and one that may be lost
 # Defaults of ArduCopter: WPNAV_SPEED_DN, LAND_ALT_LOW, LAND_SPEED; PX4 is at least as fast
 DESCENT_MPS, SLOW_BELOW_M, SLOW_MPS = 1.5, 10.0, 0.5
+DISARMING_S = 9.0  # real PX4 from 80 m: 75 s; from 3 m: 15 s
 
 
 class FlightConfig(Parameters):
@@ -126,7 +127,7 @@ def build_track(config: FlightConfig) -> Track:
             f"({PERIODS_LEAST} periods)"
         )
     slow_m = min(height_m, SLOW_BELOW_M)
-    landing_s = slow_m / SLOW_MPS + (height_m - slow_m) / DESCENT_MPS
+    landing_s = (height_m - slow_m) / DESCENT_MPS + slow_m / SLOW_MPS + DISARMING_S
     if landing_s > limits.land_s:
         raise DocumentError(
             f"reference {config.reference.title}: landing from {height_m:.4g} m takes "
