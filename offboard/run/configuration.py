@@ -128,20 +128,16 @@ def build_track(config: FlightConfig) -> Track:
         )
     slow_m = min(height_m, SLOW_BELOW_M)
     landing_s = (height_m - slow_m) / DESCENT_MPS + slow_m / SLOW_MPS + DISARMING_S
-    if landing_s > limits.land_s:
-        raise DocumentError(
-            f"reference {config.reference.title}: landing from {height_m:.4g} m takes "
-            f"{landing_s:.4g} s, longer than limits.land_s ({limits.land_s:g} s); fly lower or "
-            "allow more time"
-        )
-    for reached_m, where, limit, limit_m in (
-        (height_m, "above", "limits.ceiling_m", limits.ceiling_m),
-        (radius_m, "away from", "limits.radius_m", limits.radius_m),
+    for value, what, limit in (
+        (landing_s, f"landing from {height_m:.4g} m takes {landing_s:.4g} s", "land_s"),
+        (height_m, f"it goes {height_m:.4g} m above the take-off point", "ceiling_m"),
+        (radius_m, f"it goes {radius_m:.4g} m away from the take-off point", "radius_m"),
     ):
-        if reached_m > limit_m:  # the failsafe would end the flight there
+        most: float = getattr(limits, limit)
+        if value > most:  # the failsafe would end the flight there
             raise DocumentError(
-                f"reference {config.reference.title}: it goes {reached_m:.4g} m {where} the "
-                f"take-off point, beyond {limit} ({limit_m:g} m); fly nearer or raise the limit"
+                f"reference {config.reference.title}: {what}, beyond limits.{limit} ({most:g}); "
+                "fly lower or nearer, or raise the limit"
             )
     with outside("controller"):
         refused = config.controller.refusal(track)
