@@ -216,6 +216,19 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
         directory_lock(tmp_path / "new").__enter__()
 
 
+def test_lock_counts_as_held_if_its_holder_may_not_be_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """AppArmor and SELinux refuse a connection to a program of another domain."""
+
+    def refuses(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(socket.socket, "connect", refuses)
+    with pytest.raises(Unavailable, match="tcp:127.0.0.1:1: process unknown"):
+        connection_lock("tcp:127.0.0.1:1", 1).__enter__()
+
+
 def test_full_disk_is_told_apart_from_a_wrong_directory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
