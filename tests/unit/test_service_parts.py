@@ -189,7 +189,7 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
         "import os, sys\n"
         "from offboard.link.lock import connection_lock\n"
         "if os.getuid() == 0: os.setuid(65534)\n"
-        "with connection_lock('udpin:127.0.0.1:1'), connection_lock('tcp:127.0.0.1:1', 1):\n"
+        "with connection_lock('udpin:127.0.0.1:1'), connection_lock('tcp:127.0.0.1:1', 255):\n"
         "    print('held', flush=True)\n"
         "    sys.stdin.read()\n"
     )
@@ -202,7 +202,7 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
     with connection_lock("udpin:127.0.0.1:2"), connection_lock("tcp:127.0.0.1:1", 2):
         pass  # another connection, another vehicle behind the same router
     router = "tcp:127.0.0.1:1"
-    held = ("udpin:127.0.0.1:1",), ("udpin:127.0.0.1:1", 2), (router, 1), (router,)
+    held = ("udpin:127.0.0.1:1",), ("udpin:127.0.0.1:1", 2), (router, 255), (router,)
     for each in held:
         again = connection_lock(*each)
         with pytest.raises(Unavailable, match=f"process {holder.pid}$"), again:
@@ -327,7 +327,7 @@ def test_changed_configuration_is_used_and_a_bad_one_refused(
     assert watched.newest is first
     for _ in range(2):
         (refused,) = news(200)  # is read, but cannot be flown
-        assert "landing from 200 m" in refused
+        assert "landing from 200 m takes 155.7 s" in refused
         assert watched.newest is first
         assert news(2) == []
     assert news(3) == ["the configuration has changed: used from the next flight on"]
