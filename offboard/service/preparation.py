@@ -43,6 +43,7 @@ class Preparation:
         self._load = load
         self.newest = self._ready(load())
         self._refused = ""  # text of the newest refused one, or why it has no text
+        self._hangs = ""  # text of the newest one whose control law has not returned
         self._news: deque[str] = deque()
         self.allowed = True
         self._ended = threading.Event()
@@ -66,12 +67,13 @@ class Preparation:
 
     def look(self) -> None:
         """Read the configuration again, and use it if it has changed. A refused one is tried again,
-        because the computer may have been too busy for it, but it is announced only once."""
+        because the computer may have been too busy for it, but it is announced only once. One whose
+        control law hangs is not: each time one more thread would never end."""
         text = ""
         try:
             config = self._load()
             text = dump(config)
-            if text != self.newest.text:
+            if text not in (self.newest.text, self._hangs):
                 self.newest = self._ready(config)
                 self._news.append("the configuration has changed: used from the next flight on")
             self._refused = ""
@@ -81,6 +83,8 @@ class Preparation:
             if refused != self._refused:
                 self._news.append(f"the configuration is refused, the old one is kept: {sentence}")
             self._refused = refused
+            if isinstance(error.__context__, TimeoutError):
+                self._hangs = text
 
     def _ready(self, config: FlightConfig) -> Prepared:
         prepared = build(config)

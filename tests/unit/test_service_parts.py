@@ -7,6 +7,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from contextlib import suppress
 from functools import partial
@@ -31,6 +32,7 @@ from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.reference.track import STOP_S
+from offboard.run import flight
 from offboard.run.configuration import load
 from offboard.run.flight import build
 from offboard.service import daemon, preparation, record
@@ -187,7 +189,7 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
         "import os, sys\n"
         "from offboard.link.lock import connection_lock\n"
         "if os.getuid() == 0: os.setuid(65534)\n"
-        "with connection_lock('udpin:127.0.0.1:1'), connection_lock('tcp:127.0.0.1:1', 1):\n"
+        "with connection_lock('udpin:127.0.0.1:1'), connection_lock('tcp:127.0.0.1:1', 255):\n"
         "    print('held', flush=True)\n"
         "    sys.stdin.read()\n"
     )
@@ -200,7 +202,7 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
     with connection_lock("udpin:127.0.0.1:2"), connection_lock("tcp:127.0.0.1:1", 2):
         pass  # another connection, another vehicle behind the same router
     router = "tcp:127.0.0.1:1"
-    held = ("udpin:127.0.0.1:1",), ("udpin:127.0.0.1:1", 2), (router, 1), (router,)
+    held = ("udpin:127.0.0.1:1",), ("udpin:127.0.0.1:1", 2), (router, 255), (router,)
     for each in held:
         again = connection_lock(*each)
         with pytest.raises(Unavailable, match=f"process {holder.pid}$"), again:
@@ -214,6 +216,19 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
     ours = f"has the directory {tmp_path}/new.*: process {os.getpid()}$"
     with directory_lock(tmp_path / "new"), pytest.raises(Unavailable, match=ours):
         directory_lock(tmp_path / "new").__enter__()
+
+
+def test_lock_counts_as_held_if_its_holder_may_not_be_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """AppArmor and SELinux refuse a connection to a program of another domain."""
+
+    def refuses(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(socket.socket, "connect", refuses)
+    with pytest.raises(Unavailable, match="process unknown"):
+        connection_lock("tcp:127.0.0.1:1", 1).__enter__()
 
 
 def test_full_disk_is_told_apart_from_a_wrong_directory(
@@ -312,11 +327,31 @@ def test_changed_configuration_is_used_and_a_bad_one_refused(
     assert watched.newest is first
     for _ in range(2):
         (refused,) = news(200)  # is read, but cannot be flown
-        assert "landing from 200 m" in refused
+        assert "landing from 200 m takes 155.7 s" in refused
         assert watched.newest is first
         assert news(2) == []
     assert news(3) == ["the configuration has changed: used from the next flight on"]
     assert "height_m: 3" in watched.newest.text
+
+
+def test_configuration_whose_law_hangs_is_tried_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: every 2 s a thread was added that called the law and never ended."""
+    file = tmp_path / "my.yaml"
+    text = "vehicle: px4_sih\ncontroller: %s\nreference: {shape: hover, height_m: 2}\n"
+    file.write_text(text % "lqr")
+    watched, ended = Preparation(partial(load, str(file))), threading.Event()
+    monkeypatch.setattr(flight, "REHEARSAL_S", 0.1)
+    monkeypatch.setattr(flight, "_decided", lambda *_: ended.wait())
+    file.write_text(text % "pid")
+    before = threading.active_count()
+    for _ in range(3):
+        watched.look()
+    (refused,) = watched.news()
+    assert refused.endswith("the law pid has not returned in 0.1 s")
+    assert threading.active_count() == before + 1
+    ended.set()
 
 
 def test_pilot_switch_engages_only_in_the_air_without_failsafe() -> None:
