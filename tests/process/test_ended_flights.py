@@ -156,6 +156,7 @@ def test_deleted_log_begins_a_landing(tmp_path: Path) -> None:
 UNSCORED = {
     "interrupted": KeyboardInterrupt,
     "not enough memory": MemoryError,
+    "ValueError: axes do not match": ValueError("axes do not match"),
     "x: Input/output error": OSError(errno.EIO, os.strerror(errno.EIO), "x"),
 }
 
