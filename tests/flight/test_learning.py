@@ -318,7 +318,7 @@ def test_mass_change_in_flight_is_identified() -> None:
     ("most_s", "said"),
     [
         # the sentence does not advise to fly steps, because these were flown
-        (0.36, ["repeating the steps, tilt not identified: .* is uncertain: sd 0.032, limit 0.03$",
+        (0.38, ["repeating the steps, tilt not identified: .* is uncertain: sd 0.038, limit 0.03$",
                 "repeating the steps, tilt not identified: its delay is uncertain: "]),
         (0.6, [".*; tilt response not identified, it does not follow its command: "]),
     ],
