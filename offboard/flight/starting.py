@@ -173,7 +173,7 @@ def authority_lost_disarmed(flight: FlightState) -> str:
 
 def streamed(flight: FlightState) -> str:
     if flight.takes_off_by_command:
-        return "the autopilot takes off by itself"
+        return f"{flight.authority.engage_mode} needs no setpoints beforehand"
     return "setpoints stream" if flight.in_phase_s >= flight.limits.stream_s else ""
 
 

@@ -307,8 +307,8 @@ class VehicleEstimate:
         if not self.delay.known:
             self.cause = f"tilt response not identified, {refusal}"
             return
-        thrust = f", of the thrust and its lag {in_ms(self._thrust)}" if self._thrust.known else ""
-        self.cause = f"identified delay of the tilt {in_ms(self.delay)}{thrust}"
+        thrust = f"and its lag {in_ms(self._thrust)}" if self._thrust.known else "not identified"
+        self.cause = f"identified delay of the tilt {in_ms(self.delay)}, of the thrust {thrust}"
 
     def _confirmed(self, tilt: ResponseFit, now: Unexplained) -> bool:
         """Whether something else than this fit shows a changed delay: an earlier fit that agrees,

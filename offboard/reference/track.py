@@ -106,7 +106,8 @@ class Track:
         if self.cruise_s <= 0.0:
             raise ValueError(
                 f"run-in and run-out ({self.run_in_s:g} s and {self.run_out_s:g} s) take half "
-                f"their duration of the path, which is only {self.path.length_s:.3g} s long"
+                f"their duration of the path, which is only {self.path.length_s:.3g} s long; "
+                "lower run_in_s and run_out_s"
             )
         ends = self.path.jet(np.array([0.0, self.path_end_s]))
         speeds_mps = np.linalg.norm(ends[1, :, :HEADING], axis=1)

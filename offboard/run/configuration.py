@@ -37,7 +37,9 @@ Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 UNKNOWN_VEHICLE = "neutral"
 PERIODS_LEAST = 3  # control periods at full speed: two decisions, and one that may be lost
-DESCENT_MPS = 0.5  # slowest default near the ground: ArduCopter LAND_SPEED; MPC_LAND_SPEED is 0.7
+# Defaults of ArduCopter: WPNAV_SPEED_DN, LAND_ALT_LOW, LAND_SPEED; PX4 is at least as fast
+DESCENT_MPS, SLOW_BELOW_M, SLOW_MPS = 1.5, 10.0, 0.5
+DISARMING_S = 9.0  # real PX4 from 80 m: 75 s; from 3 m: 15 s
 
 
 class FlightConfig(Parameters):
@@ -124,21 +126,18 @@ def build_track(config: FlightConfig) -> Track:
             f"{track.track_end_s - track.track_start_s:.2g} s; a score needs {least_s:.2g} s "
             f"({PERIODS_LEAST} periods)"
         )
-    landing_s = height_m / DESCENT_MPS
-    if landing_s > limits.land_s:
-        raise DocumentError(
-            f"reference {config.reference.title}: landing from {height_m:.4g} m takes "
-            f"{landing_s:.4g} s at {DESCENT_MPS} m/s, longer than limits.land_s "
-            f"({limits.land_s:g} s); fly lower or allow more time"
-        )
-    for reached_m, where, limit, limit_m in (
-        (height_m, "above", "limits.ceiling_m", limits.ceiling_m),
-        (radius_m, "away from", "limits.radius_m", limits.radius_m),
+    slow_m = min(height_m, SLOW_BELOW_M)
+    landing_s = (height_m - slow_m) / DESCENT_MPS + slow_m / SLOW_MPS + DISARMING_S
+    for value, what, limit in (
+        (landing_s, f"landing from {height_m:.4g} m takes {landing_s:.4g} s", "land_s"),
+        (height_m, f"it goes {height_m:.4g} m above the takeoff point", "ceiling_m"),
+        (radius_m, f"it goes {radius_m:.4g} m away from the takeoff point", "radius_m"),
     ):
-        if reached_m > limit_m:  # the failsafe would end the flight there
+        most: float = getattr(limits, limit)
+        if value > most:  # the failsafe would end the flight there
             raise DocumentError(
-                f"reference {config.reference.title}: it goes {reached_m:.4g} m {where} the "
-                f"takeoff point, beyond {limit} ({limit_m:g} m); fly nearer or raise the limit"
+                f"reference {config.reference.title}: {what}, beyond limits.{limit} ({most:g}); "
+                "fly lower or nearer, or raise the limit"
             )
     with outside("controller"):
         refused = config.controller.refusal(track)

@@ -226,6 +226,7 @@ def took_off_by_command(pair: Pair) -> None:
     """ArduCopter takes off in GUIDED by one command to 1.5 m, without setpoints."""
     whole(pair)
     assert {(m.param1, m.param2) for m in pair.modes} == {(1.0, 4)}
+    assert said(pair, "GUIDED needs no setpoints beforehand")
     (takeoff,) = pair.commands(TAKEOFF)
     assert takeoff.param7 == pytest.approx(1.5)
     assert all(phase in TRACKING | {Phase.LAND} for _, phase, _ in pair.setpoints)

@@ -90,7 +90,7 @@ def test_doubt_ends_once_constants_explain_the_flight() -> None:
     assert len(estimate.sentences) == 1
     estimate.review_tilt(fit(0.05, 5.0), CONTRADICTS, 14.0)
     assert estimate.sentences[1].startswith("identified tilt delay 50 +- 2 ms, 5.0 rad/s")
-    assert estimate.cause == "identified delay of the tilt 50 +- 2 ms"
+    assert estimate.cause.endswith("tilt 50 +- 2 ms, of the thrust not identified")
     assert estimate.result is None  # what was contradicted once is not kept for the next flight
     again = estimate_with(fit(0.05))
     again.on_contradiction(CONTRADICTS, CONTRADICTS, 10.0)

@@ -213,7 +213,10 @@ def test_waypoint_paths_minimise_jerk_or_snap(minimise: str, order: int) -> None
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"shape": "line", "to_north_m": 1.0}, "run-in and run-out .* only 0.667 s long"),
+        (
+            {"shape": "line", "to_north_m": 1.0},
+            "run-in and run-out .* only 0.667 s long; lower run_in_s",
+        ),
         ({"shape": "line", "run_in_s": 0.0}, "without a run-in the path must be at rest"),
         ({"shape": "circle", "run_out_s": 0.0}, "without a run-out the path must be at rest"),
         ({"shape": "line", "to_north_m": 0.0}, "longer than zero"),
