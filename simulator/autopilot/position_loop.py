@@ -25,11 +25,9 @@ _VELOCITY_D = ("velocity_xy_d", "velocity_xy_d", "velocity_z_d")
 _INTEGRAL_XY_MAX_MPS2 = 4.0
 _REACHED_RAD = 0.05  # a smaller yaw error is turned the shorter way, whatever the sense demanded
 _TILT_COSINE_MIN = 0.1  # least divisor of the thrust
-# Estimated hover thrust, by PX4's defaults
-_HOVER_IN_AIR_M = 1.0  # height above ground from which it is estimated
-_HOVER_VALID_S = 2.0  # until it is used
-_HOVER_MEMORY_S = 14.0  # greatest time constant, from HTE_HT_NOISE
-_HOVER_RANGE = 0.2  # HTE_THR_RANGE, greatest distance from the parameter
+# Estimated hover thrust: height from which it is estimated; time constant, a mean of PX4's, which
+# grows; greatest distance from the parameter (HTE_THR_RANGE); least value
+_HOVER_IN_AIR_M, _HOVER_TIME_S, _HOVER_RANGE, _HOVER_LEAST = 1.0, 2.0, 0.2, 0.05
 # First-order low-pass of 5 Hz for the derivative of the velocity: weight of the newest value
 _TIMES_CUTOFF = LOOP_S * 2.0 * math.pi * 5.0
 _FILTER_SHARE = _TIMES_CUTOFF / (1.0 + _TIMES_CUTOFF)
@@ -66,28 +64,23 @@ class PositionLoop:
 
     def forget_hover_thrust(self) -> None:
         """Use the hover thrust of the parameter; estimate it again after the next takeoff."""
-        # what the hover thrust differs from the parameter: as estimated, and as used
-        self._hover_estimated = self._hover_used = 0.0
-        self._hover_s, self._hover_down_mps = 0.0, math.nan
+        self._hover_thrust, self._hover_down_mps = 0.0, math.nan  # 0: not estimated
 
     def estimate_hover_thrust(self, thrust: float, estimate: StateEstimate) -> None:
         """Estimate the hover thrust in the air where the firmware does so (MPC_USE_HTE), from the
         vertical thrust and the acceleration of this period. The integral takes up a change, so that
         the demanded thrust stays the same."""
         before_mps, self._hover_down_mps = self._hover_down_mps, estimate.velocity_ned_mps[2]
-        in_air = self._hover_s > 0.0 or estimate.ground_m > _HOVER_IN_AIR_M
+        in_air = self._hover_thrust > 0.0 or estimate.ground_m > _HOVER_IN_AIR_M
         if math.isnan(before_mps) or not (in_air and self._role("hover_estimated")):
             return
-        self._hover_s += LOOP_S
         given = self._role("hover_thrust")
+        old = self._hover_thrust or given
         specific_force = 1.0 + (before_mps - self._hover_down_mps) / (LOOP_S * GRAVITY_MPS2)
-        missing = thrust - (given + self._hover_estimated) * specific_force
-        found = self._hover_estimated + LOOP_S / min(self._hover_s, _HOVER_MEMORY_S) * missing
-        self._hover_estimated = min(_HOVER_RANGE, max(-_HOVER_RANGE, found))
-        if self._hover_s >= _HOVER_VALID_S:
-            share = (given + self._hover_used) / (given + self._hover_estimated)
-            self._integral_mps2[2] += (GRAVITY_MPS2 - self._down_mps2) * (1.0 - share)
-            self._hover_used = self._hover_estimated
+        found = old + LOOP_S / _HOVER_TIME_S * (thrust - old * specific_force)
+        new = min(given + _HOVER_RANGE, max(given - _HOVER_RANGE, _HOVER_LEAST, found))
+        self._integral_mps2[2] += (GRAVITY_MPS2 - self._down_mps2) * (1.0 - old / new)
+        self._hover_thrust = new
 
     def step(
         self,
@@ -117,7 +110,7 @@ class PositionLoop:
         self._turn(motion, limits, demanded)
         direction = thrust_direction(acceleration, self._role("tilt_max_rad"))
         self._down_mps2 = acceleration[2]
-        hover_thrust = self._role("hover_thrust") + self._hover_used
+        hover_thrust = self._hover_thrust or self._role("hover_thrust")
         thrust = hover_thrust * (1.0 - acceleration[2] / GRAVITY_MPS2)
         thrust = thrust / max(direction[2], _TILT_COSINE_MIN)
         thrust = min(self._role("thrust_max"), max(limits.thrust_least, thrust))
