@@ -56,12 +56,6 @@ def fly(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[..., Flight]
 
     A configuration that cannot be flown fails the test with its error. The log of a failed test is
     kept and its path printed.
-
-    Example:
-
-        def test_hovers_in_wind(fly):
-            flight = fly(reference="hover", scenario="wind_2mps", settings=["seed=5"])
-            assert flight.score.max_position_m < 0.3
     """
     flown = request.node.stash.setdefault(FLIGHTS, [])
 

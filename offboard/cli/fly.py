@@ -26,7 +26,7 @@ from offboard.cli.shared import (
 )
 from offboard.documents.arguments import LIVE_PAGE, option
 from offboard.documents.command_line import INTERRUPT, complain, drop, explained, told
-from offboard.documents.errors import UserError, plain, typed
+from offboard.documents.errors import UserError, located, plain, typed
 
 if TYPE_CHECKING:
     from offboard.analysis.score import Requirement, Score
@@ -177,12 +177,16 @@ def _judged(outcome: Outcome, directory: Path, requirements: list[Requirement]) 
     from offboard.analysis.score_table import summary
 
     rows: dict[str, str] = {}
+    unscored = ""
     try:
         score, history = scored(directory)
         outcome, rows = judged(outcome, score), summary(score, history)
-    except BaseException as error:
-        sentence, _ = told(error)
-        score = Score(ended_by=f"it cannot be scored: {sentence}")
+    except (OSError, MemoryError, KeyboardInterrupt) as error:
+        unscored, _ = told(error)
+    except Exception as error:  # also a bug of ours, after an aborted flight
+        unscored = located(error)
+    if unscored:
+        score = Score(ended_by=f"it cannot be scored: {unscored}")
         outcome = replace(outcome, sentence=f"{outcome.sentence}; {score.ended_by}")
     metrics = score.metrics()
     checked = [] if outcome.exit_code else requirements

@@ -27,7 +27,7 @@ class Situation:
         time_s: Vehicle time of the tick (`time_boot_ms` of the newest telemetry) plus the increase
             of the link delay since takeoff, s.
         state: The state predicted for the time at which a command sent now takes effect,
-            `state.time_s`.
+            `state.time_s`. Its arrays cannot be changed.
         reference: The trajectory to follow. Its time axis is vehicle time, its positions are in
             the same local NED frame as `state`.
         previous: The last attitude command sent, which is still in force.

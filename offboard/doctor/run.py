@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import inspect
 import json
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from typing import TypeVar
 
 from offboard.doctor.checks import OF_FLIGHT, OF_LINK, OF_VEHICLE, Check, wait
 from offboard.doctor.computer import OF_COMPUTER, holders
@@ -20,13 +23,13 @@ from offboard.documents.errors import Unavailable, UserError, located, shown
 from offboard.flight import preflight
 from offboard.flight.preflight import Finding, Level
 from offboard.link import clock
-from offboard.link.background import within
 from offboard.link.connection import open_link
 from offboard.link.interface import Link
 from offboard.mavlink.session import SessionSettings
 from offboard.run.configuration import FlightConfig
 from offboard.run.flight import Connection
 
+Result = TypeVar("Result")
 Rows = dict[str, list[Finding]]  # the findings of each check, the worst first
 POLL_S = 0.02
 # The command ends within 15 s: a check that takes longer is left out, and its row says so
@@ -99,7 +102,7 @@ def observe(
     with ExitStack() as stack:
         signing = vehicle.signing(stack)
         try:
-            link = within(OPEN_S, lambda: open_link(vehicle.address))
+            link = _within(OPEN_S, lambda: open_link(vehicle.address))
         except TimeoutError:
             error = f"connection {shown(vehicle.address)} cannot be opened in {OPEN_S:g} s"
         except Unavailable as failure:
@@ -126,6 +129,21 @@ def _listen(seen: Observation, link: Link, tell: Callable[[str], None]) -> None:
         tell(f"listening, {seen.listened_s:.0f} s of at most {LONGEST_S:.0f} s: {found}")
 
 
+def _within(seconds: float, call: Callable[[], Result]) -> Result:
+    """Call `call` in a new thread and return or raise what it does. Raises TimeoutError after
+    `seconds`; the thread then goes on, but the process does not wait for it when it exits."""
+    future: Future[Result] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(call())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    return future.result(seconds)
+
+
 # --- judging ---
 
 
@@ -146,7 +164,7 @@ def examine(asked: Mapping[str, Check], seen: Observation) -> Rows:
 
 def _judged(check: Check, seen: Observation, most_s: float) -> list[Finding]:
     try:
-        return within(max(most_s, LEAST_S), lambda: list(check(seen)))
+        return _within(max(most_s, LEAST_S), lambda: list(check(seen)))
     except TimeoutError:
         hint = "close other programs and check again, or `offboard check` the configuration"
         return [wait("this was not examined in time", hint)]

@@ -104,6 +104,7 @@ class Flight(FlightState):
             before_s = self.telemetry_host_s = self.host_s
         paused_s = self.host_s - before_s
         self.note_missing_setpoints()
+        session.senders.roams = bool(self.service) and self.silent_since_health
         if session.settings.lockstep:
             return
         if paused_s > PAUSE_S and self.authority.engage_mode:

@@ -48,8 +48,7 @@ def silent_on_ground(flight: FlightState) -> str:
 
 def silent_for_another(flight: FlightState) -> str:
     """After OTHER_VEHICLE_S of silence HEALTH begins again, if anything was heard in it."""
-    heard = flight.phase is not HEALTH or flight.in_phase_s > flight.silence_s
-    return silent_for(flight, OTHER_VEHICLE_S) if heard else ""
+    return "" if flight.silent_since_health else silent_for(flight, OTHER_VEHICLE_S)
 
 
 def refused(flight: FlightState) -> str:

@@ -193,6 +193,11 @@ class FlightState(Ground):
         return max(0.0, self.host_s - self.telemetry_host_s)
 
     @property
+    def silent_since_health(self) -> bool:
+        """Whether no telemetry has arrived since the present phase, HEALTH, began."""
+        return self.phase is Phase.HEALTH and self.in_phase_s <= self.silence_s
+
+    @property
     def holds_in(self) -> str:
         """The mode in which the vehicle is held or handed back."""
         return self.returns_to or self.known_dialect.hold_mode

@@ -145,7 +145,6 @@ def _enter(flight: FlightState, row: Transition) -> None:
         flight.obeyed = Request.NONE  # the flight ends for another reason
     flight.phase = row.target
     flight.began_s = flight.now_s
-    flight.session.senders.roams = row.target is Phase.HEALTH
     outbox.announce_phase(flight, reason, cause)
     if source in BEFORE_FLIGHT and row.target in FLYING:
         _begin_to_fly(flight, source)

@@ -45,7 +45,7 @@ DRAG_PRIOR_PS = Estimate(0.6, 0.4)
 THRUST_EFFECT = ("thrust_lag_s", "thrust_delay_s", "thrust_effect_s")  # accepted together
 # A link adds the same to all delays. Prior sd of the delays of yaw and thrust without the link, of
 # the thrust's lag, and of the link delay while the tilt is not identified
-YAW_DELAY_SD_S, THRUST_DELAY_SD_S, THRUST_LAG_SD_S, LINK_SD_S = 0.1, 0.03, 0.08, 0.15
+YAW_DELAY_SD_S, THRUST_DELAY_SD_S, THRUST_LAG_SD_S, LINK_SD_S = 0.1, 0.03, 0.05, 0.15
 # Sd of delay plus lag of the thrust before a fit, and the greatest of a fit
 EFFECT_SD_S = math.hypot(THRUST_DELAY_SD_S, THRUST_LAG_SD_S)
 

@@ -1,17 +1,13 @@
-"""Threads: one writes to terminal or disk, so that the loop need not wait; another calls a function
-that may never return.
-"""
+"""Background writer: a thread writes to terminal or disk, so that the loop need not wait."""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future
 from typing import Generic, TypeVar
 
 Item = TypeVar("Item")
-Result = TypeVar("Result")
 PERIOD_S = 0.02  # the thread looks for new items this often
 
 
@@ -69,18 +65,3 @@ class BackgroundWriter(Generic[Item]):
                 self.error = error
             self.dropped += self._writing
             self._writing = 0
-
-
-def within(seconds: float, call: Callable[[], Result]) -> Result:
-    """Call `call` in a new thread and return or raise what it does. Raises TimeoutError after
-    `seconds`; the thread then goes on, but the process does not wait for it when it exits."""
-    future: Future[Result] = Future()
-
-    def run() -> None:
-        try:
-            future.set_result(call())
-        except BaseException as error:
-            future.set_exception(error)
-
-    threading.Thread(target=run, daemon=True).start()
-    return future.result(seconds)

@@ -74,7 +74,7 @@ def _holder(name: str) -> int | None:
             client.connect(f"\0{name}")
         except ConnectionRefusedError:
             return None
-        except BlockingIOError:  # _REFUSED_MAX services have asked before
+        except OSError:  # _REFUSED_MAX services have asked before, or we may not ask its holder
             return 0
         shown = client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
         return int(struct.unpack("3i", shown)[0])

@@ -7,7 +7,7 @@ reported.
 
 After a restart mavlink-router and MAVProxy send from another port. Therefore another port of the
 same host becomes the vehicle's address if it sends the vehicle's frames after a silence (see
-`link.udp`), and before a flight also another host.
+`link.udp`), and while the service waits also another host.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ Everything slow (compilation, start of a simulator) happens before telemetry is 
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -28,7 +29,6 @@ from offboard.flight.record import configuration_pieces
 from offboard.identification.learner import Learner
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link import clock
-from offboard.link.background import within
 from offboard.link.connection import open_link, open_lockstep_link
 from offboard.link.interface import Link
 from offboard.link.log import FlightLog
@@ -57,7 +57,7 @@ from offboard.run.sitl import (
 from offboard.supervisor.supervisor import Supervisor
 
 REHEARSED_DECISIONS = 5  # the fastest is compared with the deadline: the computer may be busy
-REHEARSAL_S = 60.0  # a law may compile its own code when it is first called
+REHEARSAL_S = 10.0  # a law may compile its own code when it is first called
 DISCARDED_MAX = 20  # calls of `Link.receive` that `discard` makes at most
 
 
@@ -213,21 +213,26 @@ def build(config: FlightConfig) -> Prepared:
     return Prepared(config, build_controller(config), build_track(config), dump(config))
 
 
-def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
+def rehearse(
+    prepared: Prepared, *, keeps_deadline: bool, tell: Callable[[str], None] = lambda _: None
+) -> float:
     """Call every code path of observer and controller, so that nothing is compiled in flight: a
-    pause of seconds at the first decision in flight would crash the vehicle.
+    pause of seconds at the first decision in flight would crash the vehicle. `tell` is called with
+    a sentence if this takes longer than REHEARSAL_S.
 
     Returns the wall time of the shortest possible decision in seconds, NaN without
-    `keeps_deadline`. Raises DocumentError if the control law fails, does not return within
-    REHEARSAL_S or, with `keeps_deadline`, if a decision cannot meet the deadline.
+    `keeps_deadline`. Raises DocumentError if the control law fails or, with `keeps_deadline`, if a
+    decision cannot meet the deadline.
     """
     law = prepared.config.controller.law
+    waiting = f"waiting for the law {law}: it has not returned for {REHEARSAL_S:g} s"
+    late = threading.Timer(REHEARSAL_S, tell, [waiting])
+    late.daemon = True
+    late.start()
     try:
-        return within(REHEARSAL_S, lambda: _rehearsed(prepared, keeps_deadline=keeps_deadline))
-    except TimeoutError:
-        raise DocumentError(
-            f"controller: the law {law} has not returned in {REHEARSAL_S:g} s"
-        ) from None
+        return _rehearsed(prepared, keeps_deadline=keeps_deadline)
+    finally:
+        late.cancel()
 
 
 def _rehearsed(prepared: Prepared, *, keeps_deadline: bool) -> float:
@@ -340,7 +345,7 @@ def fly(
         supervisor = None if simulated else stack.enter_context(Supervisor(signing))
         tell("preparing the controller")
         prepare(tell)
-        rehearse(prepared, keeps_deadline=not simulated)
+        rehearse(prepared, keeps_deadline=not simulated, tell=tell)
         if supervisor:
             supervisor.await_ready()
         stops.check()

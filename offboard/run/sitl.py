@@ -86,9 +86,7 @@ class SimulatorProcess:
     def recall(self) -> None:
         """End the vehicle's process."""
         self.process.kill()
-        self.process.wait()
-        assert self.process.stdin is not None
-        self.process.stdin.close()
+        self.process.communicate()  # it waits, and closes the pipe
         self._errors.close()
 
 

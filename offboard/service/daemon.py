@@ -75,7 +75,7 @@ def run(
         supervisor = stack.enter_context(Supervisor(signing))
         tell("preparing the controller")
         compiled.prepare(tell)
-        preparation = stack.enter_context(closing(Preparation(load)))
+        preparation = stack.enter_context(closing(Preparation(load, tell)))
         supervisor.await_ready()
         scoring = stack.enter_context(closing(OneByOne("report" if report else "score")))
         recorder = Recorder(directory, score=scoring.add)

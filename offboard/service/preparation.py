@@ -37,11 +37,12 @@ class Preparation:
     """Keeps the newest usable configuration that `load` has returned in `newest`. A thread calls
     `load` every EVERY_S while `allowed` is True; it is False while the vehicle is armed. A changed
     configuration is built, and its controller is called, so that nothing is compiled in flight.
-    Raises DocumentError if the first configuration cannot be used."""
+    `tell` is called with what happens before the first one is ready. Raises DocumentError if that
+    cannot be used."""
 
-    def __init__(self, load: Callable[[], FlightConfig]) -> None:
+    def __init__(self, load: Callable[[], FlightConfig], tell: Callable[[str], None]) -> None:
         self._load = load
-        self.newest = self._ready(load())
+        self.newest = _ready(load(), tell)
         self._refused = ""  # text of the newest refused one, or why it has no text
         self._news: deque[str] = deque()
         self.allowed = True
@@ -72,7 +73,7 @@ class Preparation:
             config = self._load()
             text = dump(config)
             if text != self.newest.text:
-                self.newest = self._ready(config)
+                self.newest = _ready(config, self._news.append)
                 self._news.append("the configuration has changed: used from the next flight on")
             self._refused = ""
         except Exception as error:  # whatever a controller raises, the old configuration is kept
@@ -82,10 +83,11 @@ class Preparation:
                 self._news.append(f"the configuration is refused, the old one is kept: {sentence}")
             self._refused = refused
 
-    def _ready(self, config: FlightConfig) -> Prepared:
-        prepared = build(config)
-        rehearse(prepared, keeps_deadline=True)
-        return prepared
+
+def _ready(config: FlightConfig, tell: Callable[[str], None]) -> Prepared:
+    prepared = build(config)
+    rehearse(prepared, keeps_deadline=True, tell=tell)
+    return prepared
 
 
 # --- identified vehicles ---

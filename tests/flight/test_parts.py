@@ -113,13 +113,20 @@ def test_rehearsal_finds_a_law_that_exits_the_program(
         rehearse(built if of_a_law else build(resolved), keeps_deadline=False)
 
 
-def test_rehearsal_finds_a_law_that_never_returns(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rehearsal_names_a_law_that_does_not_return(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(flight, "REHEARSAL_S", 0.1)
-    prepared, ended = build(config.load("flight", known_vehicle="px4_sih")), threading.Event()
-    law = failing(lambda situation: ended.wait(), after=0)(prepared.controller)
-    with pytest.raises(DocumentError, match=r"the law pso has not returned in 0.1 s"):
-        rehearse(replace(prepared, controller=law), keeps_deadline=False)
-    ended.set()
+    prepared, told = build(config.load("flight", known_vehicle="px4_sih")), threading.Event()
+    decide, said = prepared.controller.decide, list[str]()
+    monkeypatch.setattr(
+        prepared.controller, "decide", lambda given: told.wait(20.0) and decide(given)
+    )
+
+    def tell(sentence: str) -> None:
+        said.append(sentence)
+        told.set()
+
+    rehearse(prepared, keeps_deadline=False, tell=tell)
+    assert said == ["waiting for the law pso: it has not returned for 0.1 s"]
 
 
 def test_rehearsal_finds_a_law_that_fails_at_its_deadline(

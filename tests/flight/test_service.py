@@ -623,6 +623,12 @@ def test_parameters_and_uid_are_read_again_after_a_silence(served: Served) -> No
     silence(pair, 0.0)
     assert said(pair, "the vehicle now sends from 10.0.0.3:14580")
     assert not said(pair, "another vehicle answers")
+    pair.peer = ("10.0.0.4", 14580)  # again, while its parameters keep it in the phase health
+    pair.run(4.0)
+    assert not said(pair, "the vehicle now sends from 10.0.0.4:14580")
+    pair.run(4.0)
+    assert said(pair, "the vehicle now sends from 10.0.0.4:14580")
+    assert pair.state.in_phase_s < 4.0  # in which number and parameters were read again
     pair.switch("engage")
     pair.until(lambda: pair.mode == "BRAKE", 3.0)
     assert said(pair, "not engaged: GUID_OPTIONS is 0: without bit 3")

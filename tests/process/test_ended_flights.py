@@ -34,6 +34,8 @@ from processes import (
 from offboard.analysis import history, tlog
 from offboard.flight.phases import Outcome
 from offboard.link import after_flight
+from offboard.link.stop import StopRequests
+from offboard.mavlink.outgoing import Outgoing
 from offboard.run import flight as run
 from offboard.run.configuration import load
 from offboard.run.sitl import InMemorySimulator
@@ -100,6 +102,23 @@ def test_interrupt_while_compiling_prevents_the_flight(
     assert not list(tmp_path.iterdir())
 
 
+def test_interrupt_once_the_log_exists_ends_the_flight_with_an_outcome(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(_: str) -> list[Outgoing]:
+        signal.raise_signal(signal.SIGINT)
+        return []
+
+    monkeypatch.setattr(run, "configuration_pieces", interrupted)
+    with StopRequests(lambda: pytest.fail("the program has ended")) as stops:
+        simulator = InMemorySimulator()
+        outcome = run.fly(
+            load("flight"), tmp_path / "x", run.Simulated(), simulator=simulator, stops=stops
+        )
+    assert outcome.exit_code == 3
+    assert "stop requested by the operator" in outcome.sentence
+
+
 def test_missing_vehicle_ends_fly_with_code_3(called: Called, tmp_path: Path) -> None:
     code, _, said = called(NO_VEHICLE)
     assert (code, said.count("\n")) == (3, 1)
@@ -137,6 +156,7 @@ def test_deleted_log_begins_a_landing(tmp_path: Path) -> None:
 UNSCORED = {
     "interrupted": KeyboardInterrupt,
     "not enough memory": MemoryError,
+    "ValueError: axes do not match": ValueError("axes do not match"),
     "x: Input/output error": OSError(errno.EIO, os.strerror(errno.EIO), "x"),
 }
 

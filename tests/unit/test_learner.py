@@ -81,8 +81,8 @@ def test_doubt_ends_once_constants_explain_the_flight() -> None:
     assert (unknown.tilt_s, unknown.thrust_s) == (UNKNOWN_DELAY_S, UNKNOWN_DELAY_S)
     estimate = estimate_with(fit(0.05))
     assert estimate.uncertainty.tilt_s == pytest.approx(KNOWN_S)
-    # three sd with which a fit of the thrust begins: 30 ms of the delay and 80 ms of the lag
-    assert estimate.uncertainty.thrust_s == pytest.approx(3.0 * math.hypot(0.03, 0.08))
+    # three sd with which a fit of the thrust begins: 30 ms of the delay and 50 ms of the lag
+    assert estimate.uncertainty.thrust_s == pytest.approx(3.0 * math.hypot(0.03, 0.05))
     estimate.on_contradiction(CONTRADICTS, CONTRADICTS, 10.0)
     assert estimate.uncertainty.tilt_s == DOUBTED_DELAY_S
     estimate.review_tilt(fit(0.05, 5.0, left=0.04), CONTRADICTS, 12.0)

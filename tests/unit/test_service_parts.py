@@ -187,7 +187,7 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
         "import os, sys\n"
         "from offboard.link.lock import connection_lock\n"
         "if os.getuid() == 0: os.setuid(65534)\n"
-        "with connection_lock('udpin:127.0.0.1:1'), connection_lock('tcp:127.0.0.1:1', 1):\n"
+        "with connection_lock('udpin:127.0.0.1:1'), connection_lock('tcp:127.0.0.1:1', 255):\n"
         "    print('held', flush=True)\n"
         "    sys.stdin.read()\n"
     )
@@ -200,7 +200,7 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
     with connection_lock("udpin:127.0.0.1:2"), connection_lock("tcp:127.0.0.1:1", 2):
         pass  # another connection, another vehicle behind the same router
     router = "tcp:127.0.0.1:1"
-    held = ("udpin:127.0.0.1:1",), ("udpin:127.0.0.1:1", 2), (router, 1), (router,)
+    held = ("udpin:127.0.0.1:1",), ("udpin:127.0.0.1:1", 2), (router, 255), (router,)
     for each in held:
         again = connection_lock(*each)
         with pytest.raises(Unavailable, match=f"process {holder.pid}$"), again:
@@ -214,6 +214,19 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
     ours = f"has the directory {tmp_path}/new.*: process {os.getpid()}$"
     with directory_lock(tmp_path / "new"), pytest.raises(Unavailable, match=ours):
         directory_lock(tmp_path / "new").__enter__()
+
+
+def test_lock_counts_as_held_if_its_holder_may_not_be_asked(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """AppArmor and SELinux refuse a connection to a program of another domain."""
+
+    def refuses(*_: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(socket.socket, "connect", refuses)
+    with pytest.raises(Unavailable, match="process unknown"):
+        connection_lock("tcp:127.0.0.1:1", 1).__enter__()
 
 
 def test_full_disk_is_told_apart_from_a_wrong_directory(
@@ -292,11 +305,11 @@ def test_systemd_notifications_do_not_block(monkeypatch: pytest.MonkeyPatch) -> 
 def test_changed_configuration_is_used_and_a_bad_one_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(preparation, "rehearse", lambda parts, keeps_deadline: None)
+    monkeypatch.setattr(preparation, "rehearse", lambda parts, keeps_deadline, tell: None)
     file = tmp_path / "my.yaml"
     text = "vehicle: px4_sih\ncontroller: lqr\nreference: {shape: hover, height_m: %s}\n"
     file.write_text(text % 2)
-    watched = Preparation(partial(load, str(file)))
+    watched = Preparation(partial(load, str(file)), print)
     first = watched.newest
 
     def news(height: object) -> list[str]:
@@ -312,7 +325,7 @@ def test_changed_configuration_is_used_and_a_bad_one_refused(
     assert watched.newest is first
     for _ in range(2):
         (refused,) = news(200)  # is read, but cannot be flown
-        assert "landing from 200 m" in refused
+        assert "landing from 200 m takes 155.7 s" in refused
         assert watched.newest is first
         assert news(2) == []
     assert news(3) == ["the configuration has changed: used from the next flight on"]
