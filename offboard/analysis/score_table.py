@@ -45,7 +45,7 @@ def summary(score: Score, history: History) -> dict[str, str]:
         rows["timing"] = f"setpoint {answer} after its telemetry, {missed}"
     if busy := too_busy(score.skipped_ticks, ticks, score.pause_max_s):
         rows["computer"] = busy
-    elif score.at_bound_share >= AT_LIMIT_SHARE:
+    elif score.at_bound_share >= AT_LIMIT_SHARE and "tracked error" in rows:
         share = f"{100.0 * score.at_bound_share:.0f} % of the decisions"
         rows["at a limit"] = (
             f"{share}: fly slower, in less wind, or with a lower bandwidth of the controller"

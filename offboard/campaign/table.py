@@ -18,6 +18,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -198,9 +199,14 @@ def groups(rows: Sequence[Row], drawn: frozenset[str] = frozenset()) -> list[Gro
     blocks: dict[str, dict[str, list[Row]]] = {}
     distinct = set(itertools.chain.from_iterable(_values(row.case) for row in rows))
     differ = {key for key, number in Counter(key for key, _ in distinct).items() if number > 1}
+    named = _shortened(differ - drawn, lambda key: key.rpartition(".")[2])
+    names = {name for row in rows for name in _names(row.case)}
+    stems = _shortened(names, lambda name: PurePath(name).stem)
     for row in rows:
-        own = blocks.setdefault(_block(row.case), {})
-        own.setdefault(_name(row.case, differ - drawn), []).append(row)
+        controller, *others = [stems[name] for name in _names(row.case)]
+        values = [f"{named[key]}={value}" for key, value in _values(row.case) if key in named]
+        own = blocks.setdefault(", ".join(name for name in others if name), {})
+        own.setdefault(" ".join((controller, *values)), []).append(row)
     found: list[Group] = []
     for block, members in blocks.items():
         made = [Group(name, block, tuple(rows)) for name, rows in members.items()]
@@ -220,15 +226,17 @@ def _error(group: Group) -> tuple[float, float]:
     return (math.inf, math.inf) if group.failed or math.isnan(median) else (median, highest)
 
 
-def _block(case: Case) -> str:
+def _names(case: Case) -> tuple[str, ...]:
+    """Return the controller, or the configuration without one, and the names of the block."""
     firmware = "" if case.firmware == "px4" else case.firmware
-    names = (case.reference, case.scenario, case.vehicle, case.sim_vehicle, firmware)
-    return ", ".join(name for name in names if name)
+    block = (case.reference, case.scenario, case.vehicle, case.sim_vehicle, firmware)
+    return case.controller or case.config, *(name or "" for name in block)
 
 
-def _name(case: Case, named: Collection[str]) -> str:
-    values = [f"{key}={value}" for key, value in _values(case) if key in named]
-    return " ".join((case.controller or case.config, *values))
+def _shortened(names: Collection[str], short: Callable[[str], str]) -> dict[str, str]:
+    """Return what is shown of each name: `short` of it, if that is not the same for another."""
+    number = Counter(map(short, names))
+    return {name: short(name) if number[short(name)] == 1 else name for name in names}
 
 
 def _values(case: Case) -> list[tuple[str, Any]]:

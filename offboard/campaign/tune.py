@@ -110,7 +110,10 @@ class Tuning:
         self._study = study_of(file.seed)
         with naming(source):
             self._training, self._validation, self._defaults = planned(file)
-            check([replace(self._training[0], values=tuple(self._defaults.items()))])
+            for key, ends in file.ranges.items():
+                for end in ends:
+                    replace(self._training[0], values=((key, end),)).load()
+            check([self._training[0]])
 
     @property
     def flights(self) -> int:
@@ -166,16 +169,17 @@ def _cases(file: TuneFile, flights: Flights) -> list[Case]:
 
 
 def _defaults(case: Case, file: TuneFile) -> dict[str, float]:
-    """Return the present values of the parameters. Raises DocumentError if one is no number."""
+    """Return the present values of the parameters. Raises DocumentError if one is not a
+    real number."""
     resolved = case.load().model_dump(mode="json")
     found: dict[str, float] = {}
     for key in file.ranges:
         value: Any = resolved
         for part in key.split("."):
             value = value.get(part) if isinstance(value, Mapping) else None
-        if not isinstance(value, float | int) or isinstance(value, bool):
-            raise DocumentError(f"ranges.{key} is no number of the configuration")
-        found[key] = float(value)
+        if not isinstance(value, float):
+            raise DocumentError(f"ranges.{key} is no real number of the configuration")
+        found[key] = value
     return found
 
 

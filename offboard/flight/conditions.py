@@ -11,6 +11,8 @@ from offboard.flight.state import FlightState
 
 OPERATOR = "{flight.stop_cause}"  # the cause of a row for `stop_requested`
 REBOOTED = "the vehicle restarted"
+# Relative error of hover_thrust; a smaller one does not keep a vehicle from reaching the start
+WRONG_THRUST = 0.1
 # A function that reads the flight and changes nothing. It returns False or an empty text while it
 # does not hold, and True or a text that says why while it does
 Condition = Callable[[FlightState], str | bool]
@@ -36,6 +38,14 @@ class Transition:
     def why(self, flight: FlightState) -> str:
         """The sentence that says why the row is taken, while its condition holds."""
         return self.reason.format(flight=flight) or str(self.condition(flight))
+
+
+def wrong_thrust(flight: FlightState) -> str:
+    """The end of a sentence about a climb: hover_thrust is wrong; empty if it is not."""
+    shown, flown = flight.observer.hover_thrust_estimate, flight.model.hover_thrust
+    if not abs(shown / flown - 1.0) > WRONG_THRUST:
+        return ""
+    return f"; vehicle.hover_thrust is {flown:.2f}, the flight shows about {shown:.2f}"
 
 
 # ---------------------------------------------------------------------- what is heard

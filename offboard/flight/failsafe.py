@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from offboard.flight.conditions import Condition, blind, mode_unknown, silent
+from offboard.flight.conditions import Condition, blind, mode_unknown, silent, wrong_thrust
 from offboard.flight.ground_contact import STOOD_S
 from offboard.flight.phases import TRACKING, Action, Limits, Phase
 from offboard.flight.preflight import other_sender, rare_telemetry
@@ -110,7 +110,9 @@ def away_from_reference(flight: FlightState) -> str:
     error_m = flight.position_error_m
     if not error_m > flight.limits.position_error_m:
         return ""
-    return f"{error_m:.1f} m from the reference{_other_companion(flight)}"
+    climbs = flight.phase in {Phase.CLIMB, Phase.EXCITE}
+    wrong = wrong_thrust(flight) if climbs else ""
+    return f"{error_m:.1f} m from the reference{_other_companion(flight)}{wrong}"
 
 
 def away_from_prediction(flight: FlightState) -> str:

@@ -18,6 +18,7 @@ from offboard.flight.conditions import (
     mode_unknown,
     rebooted,
     stop_requested,
+    wrong_thrust,
 )
 from offboard.flight.ground_contact import STILL_ARMED
 from offboard.flight.phases import (
@@ -44,8 +45,6 @@ SETTLED_DISTANCE_M, SETTLED_SPEED_MPS = 0.3, 0.3  # below both, it hovers at the
 NEAR_M = 0.6  # below this distance, it is near the start
 REST_S = 0.5  # after the end of the reference
 RUN_UP_S = 60.0  # until a helicopter's rotor is up to speed (ArduCopter: H_RSC_RUNUP_TIME, 0 .. 60)
-# Relative error of hover_thrust; a smaller one does not keep a vehicle from reaching the start
-WRONG_THRUST = 0.1
 
 
 def lifted_off(flight: FlightState) -> bool:
@@ -82,16 +81,12 @@ def restless(flight: FlightState) -> str:
 def too_late_at_start(flight: FlightState) -> str:
     if not flight.plan.overdue_s(flight.time_s) > flight.limits.overdue_s:
         return ""
-    observer, model = flight.observer, flight.model
     sentence = (
         f"not at rest at the start of the reference: {flight.position_error_m:.1f} m away, "
         f"{flight.plan.overdue_s(flight.time_s):.0f} s late"
     )
-    if abs(observer.hover_thrust_estimate / model.hover_thrust - 1.0) > WRONG_THRUST:
-        return (
-            f"{sentence}; the flight shows a hover thrust of {observer.hover_thrust_estimate:.2f}, "
-            f"it is flown with {model.hover_thrust:.2f}"
-        )
+    if wrong := wrong_thrust(flight):
+        return sentence + wrong
     if isinstance(flight.controller, Adaptive):
         return f"{sentence}; is the vehicle fast enough for controller.bandwidth_radps?"
     return sentence

@@ -51,8 +51,8 @@ class PositionController:
         """Begin a behaviour. `place_ned_m` is the place to which a takeoff climbs."""
         self._guidance.enter(behaviour, self._state.estimate, place_ned_m)
         self._next_loop_s = 0.0
+        self.loop.reset(self._state.estimate.yaw_rad, integral=self._setpoint is not None)
         self._setpoint = None
-        self.loop.reset(self._state.estimate.yaw_rad)
 
     def arm(self) -> None:
         """Start the motors."""
@@ -101,6 +101,10 @@ class PositionController:
         elif behaviour is not Behaviour.COAST:
             self._fly_motion(estimate)
         self._detect_landing(setpoint, estimate)
+        if self.landed:
+            self.loop.forget_hover_thrust()
+        else:
+            self.loop.estimate_hover_thrust(self.demand.thrust * estimate.tilt_cosine, estimate)
 
     def _demand(self, demand: Demand) -> None:
         """Set the demand. Keep an equal object, which the plant then need not encode again."""

@@ -25,6 +25,9 @@ _VELOCITY_D = ("velocity_xy_d", "velocity_xy_d", "velocity_z_d")
 _INTEGRAL_XY_MAX_MPS2 = 4.0
 _REACHED_RAD = 0.05  # a smaller yaw error is turned the shorter way, whatever the sense demanded
 _TILT_COSINE_MIN = 0.1  # least divisor of the thrust
+# Estimated hover thrust: height from which it is estimated; time constant, a mean of PX4's, which
+# grows; greatest distance from the parameter (HTE_THR_RANGE); least value
+_HOVER_IN_AIR_M, _HOVER_TIME_S, _HOVER_RANGE, _HOVER_LEAST = 1.0, 2.0, 0.2, 0.05
 # First-order low-pass of 5 Hz for the derivative of the velocity: weight of the newest value
 _TIMES_CUTOFF = LOOP_S * 2.0 * math.pi * 5.0
 _FILTER_SHARE = _TIMES_CUTOFF / (1.0 + _TIMES_CUTOFF)
@@ -46,15 +49,38 @@ class PositionLoop:
 
     def __init__(self, parameters: ParameterTable) -> None:
         self._role = parameters.role
+        self.forget_hover_thrust()
         self.reset(0.0)
 
-    def reset(self, yaw_rad: float) -> None:
-        """Clear the integrators and the filter; hold this yaw."""
+    def reset(self, yaw_rad: float, *, integral: bool = True) -> None:
+        """Clear the filter and, if `integral`, the integrators; hold this yaw."""
         self.yaw_rad = yaw_rad
-        self._integral_mps2 = [0.0, 0.0, 0.0]
+        if integral:
+            self._integral_mps2 = [0.0, 0.0, 0.0]
         self._acceleration_mps2 = [0.0, 0.0, 0.0]  # derivative of the estimated velocity, filtered
         self._velocity_mps = NAN3  # estimated velocity in the last period
         self._across_mps = self._down_mps = math.nan  # last speed setpoint under `Limits.smooth`
+        self._down_mps2 = 0.0  # last vertical acceleration that was demanded
+
+    def forget_hover_thrust(self) -> None:
+        """Use the hover thrust of the parameter; estimate it again after the next takeoff."""
+        self._hover_thrust, self._hover_down_mps = 0.0, math.nan  # 0: not estimated
+
+    def estimate_hover_thrust(self, thrust: float, estimate: StateEstimate) -> None:
+        """Estimate the hover thrust in the air where the firmware does so (MPC_USE_HTE), from the
+        vertical thrust and the acceleration of this period. The integral takes up a change, so that
+        the demanded thrust stays the same."""
+        before_mps, self._hover_down_mps = self._hover_down_mps, estimate.velocity_ned_mps[2]
+        in_air = self._hover_thrust > 0.0 or estimate.ground_m > _HOVER_IN_AIR_M
+        if math.isnan(before_mps) or not (in_air and self._role("hover_estimated")):
+            return
+        given = self._role("hover_thrust")
+        old = self._hover_thrust or given
+        specific_force = 1.0 + (before_mps - self._hover_down_mps) / (LOOP_S * GRAVITY_MPS2)
+        found = old + LOOP_S / _HOVER_TIME_S * (thrust - old * specific_force)
+        new = min(given + _HOVER_RANGE, max(given - _HOVER_RANGE, _HOVER_LEAST, found))
+        self._integral_mps2[2] += (GRAVITY_MPS2 - self._down_mps2) * (1.0 - old / new)
+        self._hover_thrust = new
 
     def step(
         self,
@@ -83,7 +109,9 @@ class PositionLoop:
         acceleration = self._acceleration(motion, setpoint, velocity)
         self._turn(motion, limits, demanded)
         direction = thrust_direction(acceleration, self._role("tilt_max_rad"))
-        thrust = self._role("hover_thrust") * (1.0 - acceleration[2] / GRAVITY_MPS2)
+        self._down_mps2 = acceleration[2]
+        hover_thrust = self._hover_thrust or self._role("hover_thrust")
+        thrust = hover_thrust * (1.0 - acceleration[2] / GRAVITY_MPS2)
         thrust = thrust / max(direction[2], _TILT_COSINE_MIN)
         thrust = min(self._role("thrust_max"), max(limits.thrust_least, thrust))
         if integrate:

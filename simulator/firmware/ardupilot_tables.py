@@ -147,6 +147,7 @@ ROLES: dict[str, Role] = {
     "descent_speed_mps": ("WPNAV_SPEED_DN", _CENTI),
     "cruise_speed_mps": ("WPNAV_SPEED", _CENTI),
     "hover_thrust": "MOT_THST_HOVER",
+    "hover_estimated": 0.0,
     "tilt_boost": "ATC_ANGLE_BOOST",
     "ground_station_timeout_s": "FS_GCS_TIMEOUT",
     "ground_station_needed": 0.0,

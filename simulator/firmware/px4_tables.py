@@ -169,6 +169,7 @@ ROLES: dict[str, Role] = {
     "descent_speed_mps": "MPC_Z_V_AUTO_DN",  # during a landing, far from the ground
     "cruise_speed_mps": "MPC_XY_CRUISE",
     "hover_thrust": "MPC_THR_HOVER",
+    "hover_estimated": "MPC_USE_HTE",  # not 0: the hover thrust is estimated in flight
     "tilt_boost": 0.0,  # not 0: the thrust of a setpoint is divided by the cosine of the tilt
     "ground_station_timeout_s": "COM_DL_LOSS_T",
     "ground_station_needed": "NAV_DLL_ACT",  # greater than 0: arming needs a ground station

@@ -334,7 +334,7 @@ def test_mode_report_is_awaited_after_a_pause() -> None:
     beat_s = next(at_s for at_s in beats_s if at_s > end_s)
     assert 0.3 < beat_s - end_s < 0.4
     assert beat_s <= first_s <= beat_s + PERIOD_S
-    assert watch.error_m < 0.3
+    assert watch.error_m < 0.45  # wherever on the lap the pause begins
 
 
 def test_stream_telemetry_is_not_late_after_a_pause() -> None:

@@ -185,7 +185,7 @@ CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3
         ("quick", "controllers: [nope]", "quick: there is no controller named 'nope'; known are"),
         ("c.yaml", "scenarios: [c.yaml]", "c.yaml is a campaign file; a scenario file is needed"),
         ("c.yaml", "parameters: {limits.tilt: [1]}", "limits.tilt is not a known key, did"),
-        ("t.yaml", TUNING % ("feedback", "calm"), "ranges.controller.feedback is no number of"),
+        ("t.yaml", TUNING % ("feedback", "calm"), "ranges.controller.feedback is no real number"),
     ],
 )  # fmt: skip
 def test_check_reports_errors_in_every_kind_of_file(

@@ -71,16 +71,24 @@ def test_best_groups_have_the_lowest_median_without_failures(
 
 
 def test_group_names_show_only_differing_values() -> None:
-    def name(drawn: frozenset[str]) -> list[str]:
-        case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
-        rows = [
-            row_of(replace(case, values=(("a.b", 1), ("a.c", value))), record(0.1), ())
-            for value in (2, 3)
-        ]
-        return [group.name for group in groups(rows, drawn)]
+    """A key is shown by its last part, a file by its stem, if nothing else has the same."""
 
-    assert name(frozenset()) == ["lqr a.c=2", "lqr a.c=3"]
-    assert name(frozenset({"a.c"})) == ["lqr"]
+    def names(*cases: tuple[str, dict[str, int]], drawn: frozenset[str] = frozenset()) -> list[str]:
+        case = Case("flight", None, "an/hover.csv", None, None, "px4", "calm", 1)
+        rows = [
+            row_of(replace(case, controller=law, values=tuple(values.items())), record(0.1), ())
+            for law, values in cases
+        ]
+        flown = groups(rows, drawn)
+        assert {group.block for group in flown} == {"hover, calm"}
+        return [group.name for group in flown]
+
+    cases = [("lqr", {"a.b": 1, "a.c": value}) for value in (2, 3)]
+    assert names(*cases) == ["lqr c=2", "lqr c=3"]
+    assert names(*cases, drawn=frozenset({"a.c"})) == ["lqr"]
+    same = ("x/soft.yaml", {"a.c": 1, "d.c": 1, "d.e": 1}), ("lqr", {"a.c": 2, "d.c": 2, "d.e": 2})
+    assert names(*same) == ["soft a.c=1 d.c=1 e=1", "lqr a.c=2 d.c=2 e=2"]
+    assert names(("x/lqr.yaml", {}), ("lqr", {})) == ["x/lqr.yaml", "lqr"]
 
 
 def test_table_fits_the_terminal_width(flown: list[Group]) -> None:

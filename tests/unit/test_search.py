@@ -230,7 +230,11 @@ def test_interrupted_tuning_resumes_with_the_same_result(
 def test_invalid_tuning_file_is_refused(tmp_path: Path) -> None:
     for change, sentence in (
         (("[gusts, noise]", "[calm, noise]"), "2 flights are in training and in validation"),
-        (("feedback_limit", "feedback"), "ranges.controller.feedback is no number"),
+        (("feedback_limit", "feedback"), "ranges.controller.feedback is no real number"),
+        # before, it was refused as `--set controller.swarm.particles=40.0`
+        (("feedback_limit", "swarm.particles"), "ranges.controller.swarm.particles is no real"),
+        # before, each trial above the limit was a failed flight
+        ((LIMIT + ":", LIMIT + ": [0.1, 1.5] #"), "feedback_limit: 1.5 should be less than or"),
         (("trials: 40", "objective: solve_time_p50_ms"), "is no metric of a lockstep flight"),
         ((LIMIT, "scenario.conditions.mass_scale"), "no scenario and no vehicle is tuned"),
     ):
