@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 FREEDOM = 3.0  # degrees of freedom of Student's t
-CRITICAL = (-0.5324, 0.4160, 2.9694, 1.96)  # polynomial in the share of lags, Bartlett weights
 LEAST_SCALE = 2e-4  # least scale of residuals: all smaller residuals have similar weights
 
 
@@ -37,24 +36,25 @@ class Estimate:
 
 def lag_count(related_s: float, spacing_s: float, samples: int) -> int:
     """Return the number of lags over which samples `spacing_s` apart count as autocorrelated."""
-    return min(max(round(related_s / max(spacing_s, 1e-4)), 1), samples // 2)
+    return min(max(round(related_s / max(spacing_s, 1e-4)), 1), samples // 4)
 
 
 def long_run_covariance(scores: Array, lags: int) -> Array:
     """Return the covariance (k, k) of the sum of an autocorrelated series `scores` (N, k), with
     Bartlett weights that fall to zero after `lags`.
 
-    From a short series the sum over many lags is too small and uncertain. The result is larger by
-    the square of the ratio of two critical values (5 %): for this share of lags, and of the normal
-    distribution (Kiefer and Vogelsang, 2005, table 1).
+    A fit makes the sum of `scores` zero. This reduces the covariance by a share that equals the
+    mean of the weights; the result is corrected for it (Kiefer and Vogelsang, 2005).
     """
-    covariance = scores.T @ scores
+    count = len(scores)
+    covariance, weights = scores.T @ scores, float(count)
     for lag in range(1, lags + 1):
+        weight = 1.0 - lag / (lags + 1.0)
         related = scores[lag:].T @ scores[:-lag]
-        covariance += (1.0 - lag / (lags + 1.0)) * (related + related.T)
-    critical = np.polyval(CRITICAL, (lags + 1.0) / len(scores))
-    corrected: Array = covariance * (critical / CRITICAL[-1]) ** 2
-    return corrected
+        covariance += weight * (related + related.T)
+        weights += 2.0 * weight * (count - lag)
+    restored: Array = covariance / (1.0 - weights / count**2)
+    return restored
 
 
 def sandwich(curvature: Array, scores_covariance: Array) -> Array:

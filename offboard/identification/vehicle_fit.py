@@ -40,7 +40,7 @@ LEAST_SECONDS = 2.0
 LEAST_SPEED_MPS, LEAST_THRUST_CHANGE = 0.4, 0.015
 # Greatest accepted standard deviations. That of the hover thrust is relative, and large, because a
 # vehicle file may be wrong by much more; then the drag would be wrong too
-DRAG_SD_PS, HOVER_SD = 0.25, 0.05
+DRAG_SD_PS, HOVER_SD = 0.2, 0.05
 DRAG_PRIOR_PS = Estimate(0.6, 0.4)
 THRUST_EFFECT = ("thrust_lag_s", "thrust_delay_s", "thrust_effect_s")  # accepted together
 # A link adds the same to all delays. Prior sd of the delays of yaw and thrust without the link, of
