@@ -105,7 +105,7 @@ class VehicleEstimate:
         known_s = SDS * self._delay_sd_s if self.delay.known else self._unknown_s
         thrust_s = SDS * EFFECT_SD_S if self.delay.known else self._unknown_s
         if self._thrust.known:
-            thrust_s = SDS * self._thrust_sd_s
+            thrust_s = min(thrust_s, SDS * self._thrust_sd_s)
         tilt_s = max(known_s, self._doubt_s, changed_s)
         return DelayUncertainty(tilt_s=tilt_s, thrust_s=thrust_s, link_s=added_s)
 

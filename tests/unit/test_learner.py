@@ -360,6 +360,6 @@ def test_disabled_identification_flies_the_vehicle_file() -> None:
     assert changed is not None
     assert changed.vehicle == FILE.model_copy(update=slower)
     again = Learner(FILE, IdentifySettings(), known=replace(recalled, thrust_sd_s=0.09))
-    assert again.uncertainty.thrust_s == pytest.approx(0.27)
+    assert again.uncertainty.thrust_s == pytest.approx(3.0 * math.hypot(0.03, 0.05))  # not 0.27
     assert update.cause.endswith("the vehicle file's delay may be wrong by 130 ms")
     assert (update.sentences, learner.result) == ((), None)
