@@ -17,8 +17,9 @@ from typing import Any
 from offboard.identification.attitude_fit import ResponseFit, Unexplained
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import (
-    EFFECT_SD_S,
     LINK_S,
+    THRUST_DELAY_SD_S,
+    THRUST_LAG_SD_S,
     Identified,
     summary,
     with_link_delay,
@@ -32,6 +33,7 @@ UNKNOWN_DELAY_S = 0.4
 FILE_DELAY_S = 0.13  # vehicle file that is flown without identification
 DOUBTED_DELAY_S = 0.28  # tilt, fitted or flown before, that telemetry contradicts
 SDS = 3.0  # identified delay, in standard deviations
+THRUST_SD_S = math.hypot(THRUST_DELAY_SD_S, THRUST_LAG_SD_S)  # of delay plus lag, before a fit
 DIRECT_LINK_S = 0.004  # delay of a fast link: age of telemetry
 LINK_DIGITS = 2  # delays of the link are rounded to 10 ms: smaller changes are ignored
 # After so many contradictions the delay stays uncertain until nothing contradicts for CALM_S
@@ -103,7 +105,7 @@ class VehicleEstimate:
         """The uncertainty of the delays of `vehicle`."""
         added_s, changed_s = self._link
         known_s = SDS * self._delay_sd_s if self.delay.known else self._unknown_s
-        thrust_s = SDS * EFFECT_SD_S if self.delay.known else self._unknown_s
+        thrust_s = SDS * THRUST_SD_S if self.delay.known else self._unknown_s
         if self._thrust.known:
             thrust_s = min(thrust_s, SDS * self._thrust_sd_s)
         tilt_s = max(known_s, self._doubt_s, changed_s)

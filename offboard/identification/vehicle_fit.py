@@ -40,14 +40,12 @@ LEAST_SECONDS = 2.0
 LEAST_SPEED_MPS, LEAST_THRUST_CHANGE = 0.4, 0.015
 # Greatest accepted standard deviations. That of the hover thrust is relative, and large, because a
 # vehicle file may be wrong by much more; then the drag would be wrong too
-DRAG_SD_PS, HOVER_SD = 0.2, 0.05
+DRAG_SD_PS, HOVER_SD, EFFECT_SD_S = 0.2, 0.05, 0.1
 DRAG_PRIOR_PS = Estimate(0.6, 0.4)
 THRUST_EFFECT = ("thrust_lag_s", "thrust_delay_s", "thrust_effect_s")  # accepted together
 # A link adds the same to all delays. Prior sd of the delays of yaw and thrust without the link, of
 # the thrust's lag, and of the link delay while the tilt is not identified
 YAW_DELAY_SD_S, THRUST_DELAY_SD_S, THRUST_LAG_SD_S, LINK_SD_S = 0.1, 0.03, 0.05, 0.15
-# Sd of delay plus lag of the thrust before a fit, and the greatest of a fit
-EFFECT_SD_S = math.hypot(THRUST_DELAY_SD_S, THRUST_LAG_SD_S)
 
 # Greatest lag of an overdamped response if the factor allows no more; ArduCopter with ATC_INPUT_TC
 # 1 has 1 s
@@ -283,7 +281,7 @@ def _accepted_vertical(
     elif not effect.sd <= EFFECT_SD_S:
         refusals["thrust_lag_s"] = (
             f"delay and lag of the thrust are uncertain: sd {effect.sd:.2g} s, "
-            f"limit {EFFECT_SD_S:.2g} s"
+            f"limit {EFFECT_SD_S} s"
         )
     else:
         accepted |= {name: fit[name] for name in THRUST_EFFECT}
