@@ -200,8 +200,8 @@ def _begin_health(flight: FlightState, source: Phase) -> None:
 
 
 def _begin_stream(flight: FlightState, source: Phase) -> None:
-    # from now on another mode is a pilot's; a vehicle that shows OFFBOARD already gets no request
-    flight.authority.ask()
+    if not flight.in_engage_mode:  # else it may still enter hold, as requested in HEALTH
+        flight.authority.ask()  # from now on another mode is a pilot's
     _set_hover_thrust(flight)
 
 
@@ -269,6 +269,7 @@ def _begin_climb(flight: FlightState, source: Phase) -> None:
 BEGINS: Mapping[Phase, Callable[[FlightState, Phase], None]] = {
     Phase.HEALTH: _begin_health,
     Phase.STREAM: _begin_stream,
+    Phase.ENGAGE: lambda flight, _: flight.authority.ask(),  # it may show the mode already
     Phase.TAKEOFF: _begin_takeoff,
     Phase.CLIMB: _begin_climb,
     Phase.JOIN: _begin_join,

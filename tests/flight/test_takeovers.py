@@ -15,7 +15,7 @@ from collections.abc import Callable
 import pytest
 from faults import CURRENT_MODE, HEARTBEAT, losing, without
 from pair import Pair, decode, frame_id, frames_of, in_phase, level_setpoint
-from watch import SET_MESSAGE_INTERVAL, Vehicle, aborted, begun_s, copter, px4, refused
+from watch import SET_MESSAGE_INTERVAL, Vehicle, aborted, begun_s, copter, flown, px4, refused
 
 from offboard.flight.authority import Standing
 from offboard.flight.phases import ENDS, ExitCode, Phase
@@ -129,6 +129,16 @@ def test_mode_that_a_pilot_selects_while_setpoints_stream_is_kept() -> None:
     pair.at.append((in_phase(Phase.STREAM, 0.5), lambda _: switch("POSCTL")))
     refused(pair, "POSCTL was selected before OFFBOARD")
     assert (pair.modes, pair.armings, pair.mode) == ([], [], "POSCTL")
+
+
+def test_hold_requested_before_the_stream_may_be_shown_during_it() -> None:
+    """A PX4 without CURRENT_MODE shows OFFBOARD late in HEALTH, and hold, as `fly` requests, in the
+    next HEARTBEAT. Regression: that mode was taken for a pilot's, and the flight refused."""
+    pair = px4.hop(down=without(CURRENT_MODE))
+    switch = pair.instance.autopilot.commander.switch
+    pair.at.append((in_phase(Phase.HEALTH, 1.0), lambda _: switch("OFFBOARD")))
+    flown(pair)
+    assert len(pair.modes) > 1
 
 
 def test_hold_requested_on_the_ground_is_requested_again_in_flight() -> None:
