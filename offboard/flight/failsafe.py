@@ -110,8 +110,7 @@ def away_from_reference(flight: FlightState) -> str:
     error_m = flight.position_error_m
     if not error_m > flight.limits.position_error_m:
         return ""
-    climbs = flight.phase in {Phase.CLIMB, Phase.EXCITE}
-    wrong = wrong_thrust(flight) if climbs else ""
+    wrong = wrong_thrust(flight) if flight.phase in {Phase.CLIMB, Phase.EXCITE} else ""
     return f"{error_m:.1f} m from the reference{_other_companion(flight)}{wrong}"
 
 
