@@ -177,7 +177,7 @@ def _judged(outcome: Outcome, directory: Path, requirements: list[Requirement]) 
     from offboard.analysis.score_table import summary
 
     rows: dict[str, str] = {}
-    unscored = ""
+    unscored: str | None = None
     try:
         score, history = scored(directory)
         outcome, rows = judged(outcome, score), summary(score, history)
@@ -185,7 +185,7 @@ def _judged(outcome: Outcome, directory: Path, requirements: list[Requirement]) 
         unscored, _ = told(error)
     except Exception as error:  # also a bug of ours, after an aborted flight
         unscored = located(error)
-    if unscored:
+    if unscored is not None:
         score = Score(ended_by=f"it cannot be scored: {unscored}")
         outcome = replace(outcome, sentence=f"{outcome.sentence}; {score.ended_by}")
     metrics = score.metrics()
