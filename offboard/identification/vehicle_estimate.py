@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from offboard.identification.attitude_fit import ResponseFit, Unexplained
@@ -213,6 +213,9 @@ class VehicleEstimate:
         within, sentences = self.within_bounds(found)
         if any(getattr(found, name) and not getattr(within, name) for name in DECISIVE):
             self.contradiction = "; ".join(sentences)
+        hover, used = within.hover_thrust, self.vehicle.hover_thrust
+        if hover and abs(hover.value - used) <= SDS * hover.sd:  # the one in use may be better
+            within = replace(within, hover_thrust=None)
         applied = within.applied_to(self.vehicle)
         if within.thrust_delay_s and within.thrust_effect_s:
             self._thrust_sd_s = within.thrust_effect_s.sd

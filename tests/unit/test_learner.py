@@ -74,6 +74,15 @@ def test_identified_values_are_adopted_only_within_file_limits() -> None:
         assert estimate_with(found).contradiction.endswith("allowed), not adopted")
 
 
+def test_hover_thrust_in_use_is_kept_if_a_fit_agrees() -> None:
+    """It may have been measured before the take-over, better than steps show it."""
+    estimate = VehicleEstimate(FILE, delay_error_s=UNKNOWN_DELAY_S)
+    for fitted, used in ((1.02, 1.0), (1.3, 1.3)):
+        hover = Estimate(fitted * FILE.hover_thrust, 0.02 * FILE.hover_thrust)
+        estimate.adopt(Identified(5.0, hover_thrust=hover), 0.0)
+        assert estimate.vehicle.hover_thrust == pytest.approx(used * FILE.hover_thrust)
+
+
 def test_doubt_ends_once_constants_explain_the_flight() -> None:
     """A fit that leaves too much unexplained is refused, the next one is adopted. Once the
     constants in use explain the flight again, a fit that explains no more is refused."""
