@@ -16,6 +16,8 @@ from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command
 
 HEARTBEAT, AUTOPILOT_VERSION = 0, 148  # message ids
+# A HEARTBEAT is requested after so long; sooner without CURRENT_MODE (PX4 1.14), or a pilot might
+# leave the mode and return unseen
 HEARTBEAT_DUE_S, HEARTBEAT_ALONE_DUE_S, HEARTBEAT_EVERY_S = 1.3, 0.2, 0.15
 MODE_REPORTED_S = 3.0  # PX4 1.15 sends CURRENT_MODE twice a second, and when it changes
 FIT_EVERY_S = 4.0  # between two reductions of the telemetry: a backlog must drain first

@@ -72,7 +72,8 @@ def admit(
         late_s: time by which the setpoint is ready later than one control period after the arrival
             of its telemetry; not positive if it is ready in time.
 
-    Raises Refused.
+    Raises Refused if the vehicle is not ours, the telemetry was too old, the decision too late, or
+    a value cannot be sent.
     """
     if not ours:
         raise Refused(Refusal.NOT_OURS, "the vehicle is not ours")

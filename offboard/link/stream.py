@@ -45,6 +45,7 @@ def connect(host: str, port: int) -> Stream:
 
 
 def tcp_stream(connection: socket.socket, host: str) -> Stream:
+    """A connected socket as a stream."""
     connection.setblocking(False)
     with suppress(OSError):
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
