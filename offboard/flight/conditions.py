@@ -45,7 +45,9 @@ def wrong_thrust(flight: FlightState) -> str:
     shown, flown = flight.observer.hover_thrust_estimate, flight.model.hover_thrust
     if not abs(shown / flown - 1.0) > WRONG_THRUST:
         return ""
-    return f"; hover thrust {flown:.2f}, the flight shows about {shown:.2f} (vehicle.hover_thrust)"
+    return (
+        f"; flown with hover thrust {flown:.2f}, it is about {shown:.2f}: set vehicle.hover_thrust"
+    )
 
 
 # ---------------------------------------------------------------------- what is heard

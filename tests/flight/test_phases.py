@@ -406,7 +406,7 @@ def test_hint_for_a_slow_climb_names_existing_settings() -> None:
     no hint for a law without bandwidth."""
     bandwidth = "; is the vehicle fast enough for controller.bandwidth_radps?"
     for law, shown, hint in (
-        ("pso", 0.7, "; hover thrust 0.42, the flight shows about 0.70 (vehicle.hover_thrust)"),
+        ("pso", 0.7, "; flown with hover thrust 0.42, it is about 0.70: set vehicle.hover_thrust"),
         ("pso", 0.42, bandwidth),
         ("autopilot", 0.42, ""),
     ):

@@ -192,8 +192,8 @@ def names_no_speed(pair: Pair) -> None:
 
 
 WRONG_THRUST = (
-    r".*from the reference; hover thrust 0\.42, the flight shows about 0\.\d+ "
-    r"\(vehicle\.hover_thrust\)"
+    r".*from the reference; flown with hover thrust 0\.42, it is about 0\.\d+: set "
+    r"vehicle\.hover_thrust"
 )
 STREAMED = {"fault": "second_sender", "setpoint_rate_hz": 10.0, "thrust": 0.49}
 OFFBOARD, GUIDED = {"height_m": 8.0, "mode": "OFFBOARD"}, {"height_m": 8.0, "mode": "GUIDED"}
