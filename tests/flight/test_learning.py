@@ -99,8 +99,12 @@ def test_unknown_vehicle_is_identified_in_flight_and_from_its_log(true: Vehicle)
         "tilt_damping": pytest.approx(true.tilt.damping, abs=0.05),
         "hover_thrust": pytest.approx(true.hover_thrust, rel=0.02),
         "drag_ps": pytest.approx(true.drag_per_mass_ps, rel=0.1, abs=0.08),
+        "thrust_delay_s": pytest.approx(true.thrust_delay_s, abs=0.03),
+        "thrust_lag_s": pytest.approx(true.thrust_lag_s, abs=0.03),
     }.items():
         assert values[name] == expected, name
+        each = found.estimates[name]
+        assert abs(each.value - expected.expected) < 3.0 * each.sd, name
     written = parse(vehicle_file(found, NEUTRAL, "a flight"), Vehicle, "vehicle.yaml")
     assert written.tilt.damping == pytest.approx(values["tilt_damping"], abs=1e-3)
     assert written.hover_thrust == pytest.approx(values["hover_thrust"], abs=1e-4)
