@@ -133,7 +133,7 @@ class Commands:
 
     def _reposition(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_DO_REPOSITION: fly to a place and hold it. The present position replaces
-        coordinates that are not finite."""
+        coordinates that are not finite. For PX4 the height is above mean sea level in any frame."""
         ardupilot, mode = autopilot.firmware.ardupilot_commands, autopilot.firmware.reposition_mode
         there = ardupilot and autopilot.commander.mode.name == mode
         if command.params[1] != _CHANGE_MODE and not there:
@@ -150,7 +150,8 @@ class Commands:
         result = autopilot.handle("mode", Request(mode))
         if result is Result.ACCEPTED and autopilot.commander.armed:
             yaw_rad = yaw_rad if math.isfinite(yaw_rad) else math.nan
-            place = self._place(latitude, longitude, height_m, command.frame or 0)
+            frame = (ardupilot and command.frame) or 0
+            place = self._place(latitude, longitude, height_m, frame)
             autopilot.go_to(place, yaw_rad)
             if math.isfinite(speed_mps):
                 autopilot.guidance.cruise_mps = speed_mps

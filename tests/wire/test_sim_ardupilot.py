@@ -375,6 +375,7 @@ def test_arducopter_reposition_moves_as_on_the_real_one() -> None:
     ("firmware", "x", "frame", "result"),
     [
         (PX4, 2**31 - 1, ABSOLUTE, ACCEPTED),  # "no place": the present one
+        (PX4, 2**31 - 1, RELATIVE, ACCEPTED),  # above mean sea level, whatever the frame
         (ARDUPILOT, 2**31 - 1, RELATIVE, DENIED),
         (ARDUPILOT, 950_000_000, RELATIVE, DENIED),
     ],
@@ -383,7 +384,7 @@ def test_reposition_without_a_valid_place_does_not_move(
     firmware: Firmware, x: int, frame: int, result: int
 ) -> None:
     bench = flying(firmware)
-    up_m = 5.0 + (bench.instance.autopilot.firmware.origin[2] if frame == ABSOLUTE else 0.0)
+    up_m = 5.0 + (bench.instance.autopilot.firmware.origin[2] if firmware is PX4 else 0.0)
     assert command_int(bench, frame, 192, -1.0, 1, 0, NAN, x, x, up_m) == result
     bench.run(3.0)
     assert bench.place == pytest.approx((0.0, 0.0, -5.0), abs=0.5)
