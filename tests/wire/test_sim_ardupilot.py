@@ -356,6 +356,20 @@ def test_requested_speed_holds_until_another_kind_of_setpoint() -> None:
     assert fastest_mps(bench, 6.0) > 7.0
 
 
+def test_arducopter_integrates_an_acceleration_to_a_velocity() -> None:
+    """The real one had flown 2.0 m after 3 s of setpoints; without them it flies on for 3 s."""
+    bench = flying()
+    fields = (0, 1, 1, 1, 0xC3F, *(0.0,) * 6, 0.5, *(0.0,) * 4)
+    setpoint = mavlink.MAVLink_set_position_target_local_ned_message(*fields)
+    bench.run(3.0, lambda: bench.send(setpoint), 0.1)
+    assert bench.place == pytest.approx((2.0, 0.0, -5.0), abs=0.4)
+    bench.run(2.8)
+    assert bench.velocity == pytest.approx((2.9, 0.0, 0.0), abs=0.3)
+    assert bench.place == pytest.approx((8.4, 0.0, -5.0), abs=0.9)
+    bench.run(4.0)
+    assert bench.velocity == pytest.approx((0.0, 0.0, 0.0), abs=0.3)
+
+
 def test_arducopter_reposition_moves_as_on_the_real_one() -> None:
     """Expected are metres from the start after each second. Only COMMAND_INT is accepted."""
     bench = flying()
