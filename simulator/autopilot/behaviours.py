@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from enum import Enum
 
+from offboard.model.frames import wrap_pi
 from simulator.autopilot.guidance import ActiveBehaviour, Guidance, stopping_place_ned_m
 from simulator.autopilot.state import StateEstimate
 from simulator.autopilot.values import NAN3, Behaviour, MotionSetpoint, Triple
@@ -235,6 +236,27 @@ class FollowSetpoint(ActiveBehaviour):
         return self.guidance.firmware.ardupilot_setpoints
 
 
+class Orbit(ActiveBehaviour):
+    """PX4 ORBIT: flies `guidance.circle`."""
+
+    def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
+        circle, (x, y, _) = self.guidance.circle, estimate.position_ned_m
+        north, east, down = circle.centre_ned_m
+        radius_m = abs(circle.radius_m)
+        bearing_rad = math.atan2(y - east, x - north)
+        cos, sin = math.cos(bearing_rad), math.sin(bearing_rad)
+        outward_mps = radius_m - math.hypot(x - north, y - east)
+        along_mps = math.copysign(circle.speed_mps, circle.radius_m)
+        inward_mps2 = along_mps**2 / radius_m
+        turned_rad = {0: math.pi, 3: math.copysign(0.5 * math.pi, along_mps)}  # to centre, tangent
+        return MotionSetpoint(
+            (math.nan, math.nan, down),
+            (outward_mps * cos - along_mps * sin, outward_mps * sin + along_mps * cos, math.nan),
+            (-inward_mps2 * cos, -inward_mps2 * sin, math.nan),
+            wrap_pi(bearing_rad + turned_rad.get(circle.yaw, math.nan)),
+        )
+
+
 BEHAVIOURS: Mapping[Behaviour, type[ActiveBehaviour]] = {
     # hold, or fly to the place that a client named: PX4 AUTO.LOITER; ArduCopter BRAKE
     Behaviour.HOLD: ActiveBehaviour,
@@ -247,4 +269,5 @@ BEHAVIOURS: Mapping[Behaviour, type[ActiveBehaviour]] = {
     Behaviour.LEVEL: ActiveBehaviour,
     Behaviour.COAST: ActiveBehaviour,
     Behaviour.SETPOINT: FollowSetpoint,
+    Behaviour.ORBIT: Orbit,
 }

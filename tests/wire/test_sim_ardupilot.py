@@ -21,6 +21,7 @@ from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.px4 import PX4
 
 AUTO, GUIDED, LAND, BRAKE, THROW = 3, 4, 9, 17, 18
+HOLD = 0x03040000  # of PX4
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
 HOVER = 0.3655
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -482,6 +483,27 @@ def test_px4_faces_its_goal_and_then_takes_the_requested_yaw() -> None:
     assert reposition(bench, 1.0, 30.0, amsl_m, ABSOLUTE) == ACCEPTED  # nearer than NAV_ACC_RAD
     bench.run(4.0)
     assert off_deg(bench, -45.0) < 3.0
+
+
+@pytest.mark.parametrize("radius_m", [10.0, -10.0])
+def test_px4_flies_an_orbit_with_its_nose_to_the_centre(radius_m: float) -> None:
+    """The real one was 9.6 to 10.5 m from the centre and flew 1.5 to 1.7 m/s when 2 were asked."""
+    bench = aloft(height_m=3.0)
+    amsl_m = bench.instance.autopilot.firmware.origin[2] + 3.0
+    x, y = (round(value * 1e7) for value in degrees(bench, 0.0, 0.0))
+    assert command_int(bench, ABSOLUTE, 34, radius_m, 2.0, 0.0, NAN, x, y, amsl_m) == ACCEPTED
+    bench.run(20.0)
+    assert bench.of("HEARTBEAT")[-1][1].custom_mode == 0x01030000
+    (north, east, down), (v_north, v_east, _) = bench.place, bench.velocity
+    assert math.hypot(north, east) == pytest.approx(10.0, abs=0.7)
+    assert down == pytest.approx(-3.0, abs=0.4)
+    turned = (north * v_east - east * v_north) / math.hypot(north, east)
+    assert turned == pytest.approx(math.copysign(1.6, radius_m), abs=0.25)
+    assert off_deg(bench, math.degrees(math.atan2(-east, -north))) < 12.0
+    assert bench.command(186, amsl_m + 4.0) == [ACCEPTED]  # ends the orbit
+    bench.run(8.0)
+    assert bench.mode == HOLD
+    assert bench.height_m == pytest.approx(7.0, abs=0.5)
 
 
 @pytest.mark.parametrize(
