@@ -59,6 +59,9 @@ def test_arducopter_sends_heartbeat_timesync_and_home_unrequested() -> None:
         "GPS_GLOBAL_ORIGIN": 1,
         "HOME_POSITION": 1,
     }
+    vehicle.send(mavlink.MAVLink_autopilot_version_request_message(1, 1))  # of Mission Planner
+    vehicle.run(0.02)
+    assert len(vehicle.of("AUTOPILOT_VERSION")) == 1
 
 
 def test_arducopter_streams_a_requested_group_also_after_an_interval_of_0() -> None:
