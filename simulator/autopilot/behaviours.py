@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from enum import Enum
 
+from offboard.model.frames import wrap_pi
 from simulator.autopilot.guidance import ActiveBehaviour, Guidance, stopping_place_ned_m
 from simulator.autopilot.state import StateEstimate
-from simulator.autopilot.values import Behaviour, MotionSetpoint, Triple
+from simulator.autopilot.values import NAN3, Behaviour, MotionSetpoint, Triple
+from simulator.steps import LOOP_S
 
 _FLATTEST = 1000.0  # limit of a takeoff from the ground: m horizontally per m of climb
 _STILL_MPS = 0.05  # sticks: with a lower velocity demand the vehicle holds its place
@@ -207,18 +210,51 @@ class FollowSetpoint(ActiveBehaviour):
     position controller flies an attitude setpoint itself and then does not call `motion`."""
 
     lifts_off = True
+    _velocity_ned_mps = NAN3  # integral of accelerations
 
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
         setpoint = self.guidance.newest
         if isinstance(setpoint, MotionSetpoint):
             self.cannot_climb = False
-            return setpoint
+            return self._integrated(setpoint, estimate) if self.automatic else setpoint
         self.cannot_climb = landed  # a landed vehicle waits for a setpoint or a takeoff
         return self.guidance.hold
+
+    def _integrated(self, setpoint: MotionSetpoint, estimate: StateEstimate) -> MotionSetpoint:
+        """ArduCopter integrates an acceleration without position and velocity to a velocity."""
+        before_ned_mps, self._velocity_ned_mps = self._velocity_ned_mps, NAN3
+        if not all(map(math.isnan, (*setpoint.position_ned_m, *setpoint.velocity_ned_mps))):
+            return setpoint
+        if math.isnan(before_ned_mps[0]):
+            before_ned_mps = estimate.velocity_ned_mps
+        (x, y, z), (ax, ay, az) = before_ned_mps, setpoint.acceleration_ned_mps2
+        self._velocity_ned_mps = (x + ax * LOOP_S, y + ay * LOOP_S, z + az * LOOP_S)
+        return replace(setpoint, velocity_ned_mps=self._velocity_ned_mps)
 
     @property
     def automatic(self) -> bool:
         return self.guidance.firmware.ardupilot_setpoints
+
+
+class Orbit(ActiveBehaviour):
+    """PX4 ORBIT: flies `guidance.circle`."""
+
+    def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
+        circle, (x, y, _) = self.guidance.circle, estimate.position_ned_m
+        north, east, down = circle.centre_ned_m
+        radius_m = abs(circle.radius_m)
+        bearing_rad = math.atan2(y - east, x - north)
+        cos, sin = math.cos(bearing_rad), math.sin(bearing_rad)
+        outward_mps = radius_m - math.hypot(x - north, y - east)
+        along_mps = math.copysign(circle.speed_mps, circle.radius_m)
+        inward_mps2 = along_mps**2 / radius_m
+        turned_rad = {0: math.pi, 3: math.copysign(0.5 * math.pi, along_mps)}  # to centre, tangent
+        return MotionSetpoint(
+            (math.nan, math.nan, down),
+            (outward_mps * cos - along_mps * sin, outward_mps * sin + along_mps * cos, math.nan),
+            (-inward_mps2 * cos, -inward_mps2 * sin, math.nan),
+            wrap_pi(bearing_rad + turned_rad.get(circle.yaw, math.nan)),
+        )
 
 
 BEHAVIOURS: Mapping[Behaviour, type[ActiveBehaviour]] = {
@@ -233,4 +269,5 @@ BEHAVIOURS: Mapping[Behaviour, type[ActiveBehaviour]] = {
     Behaviour.LEVEL: ActiveBehaviour,
     Behaviour.COAST: ActiveBehaviour,
     Behaviour.SETPOINT: FollowSetpoint,
+    Behaviour.ORBIT: Orbit,
 }

@@ -18,7 +18,14 @@ from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.position_loop import level
 from simulator.autopilot.state import StateEstimate
 from simulator.autopilot.sticks import Sticks
-from simulator.autopilot.values import NAN3, AttitudeSetpoint, Behaviour, MotionSetpoint, Triple
+from simulator.autopilot.values import (
+    NAN3,
+    AttitudeSetpoint,
+    Behaviour,
+    Circle,
+    MotionSetpoint,
+    Triple,
+)
 
 ORIGIN: Triple = (0.0, 0.0, 0.0)
 Setpoint = AttitudeSetpoint | MotionSetpoint
@@ -99,6 +106,7 @@ class Guidance:
         self.cruise_mps = math.inf  # speed requested for automatic flight; inf: none
         # region of interest, faced until the next setpoint
         self.region_ned_m: tuple[float, float] | None = None
+        self.circle = Circle(ORIGIN, 1.0, 1.0, 0)
         self._behaviours = behaviours
         self.behaviour = Behaviour.HOLD
         self.active = behaviours[Behaviour.HOLD](self)

@@ -37,8 +37,8 @@ class Health:
         self._battery_level = 0  # last level that was reported (`Firmware.battery_level`)
         self._worse_s = math.nan  # time since which the level is greater than that
         self._fix_s = -math.inf  # time of the last GPS fix
-        self._flown = False  # whether the vehicle was in the air since arming
-        self._armed_s = self._landed_s = -math.inf
+        self.took_off_s = 0.0  # time of the last takeoff since arming, 0: none
+        self.armed_s = self._landed_s = -math.inf
 
     # -- events ------------------------------------------------------------------------------
 
@@ -98,12 +98,12 @@ class Health:
 
     def arm(self, now_s: float, landed: bool) -> None:
         """Note that the motors start, on the ground or in the air."""
-        self._flown, self._armed_s = not landed, now_s
+        self.took_off_s, self.armed_s = 0.0 if landed else now_s, now_s
 
     def flight(self, now_s: float, was_landed: bool, landed: bool) -> Iterator[str]:
         """Events of takeoff and landing of an armed vehicle."""
         if was_landed and not landed:
-            self._flown = True
+            self.took_off_s = now_s
             yield "took off"
         if landed and not was_landed:
             self._landed_s = now_s
@@ -114,8 +114,8 @@ class Health:
         "idle"."""
         if not landed:
             return
-        event, since_s, role = "idle", self._armed_s, "disarm_idle_s"
-        if self._flown:
+        event, since_s, role = "idle", self.armed_s, "disarm_idle_s"
+        if self.took_off_s:
             event, since_s, role = "settled", self._landed_s, "disarm_landed_s"
         limit_s = self._parameters.role(role)
         if limit_s > 0 and now_s - since_s >= limit_s - 1e-6:

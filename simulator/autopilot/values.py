@@ -98,6 +98,17 @@ class Behaviour(Enum):
     LEVEL = "level attitude, least throttle: a manual mode with sticks down"
     COAST = "keeps the last demand: a manual mode without stick input"
     SETPOINT = "obeys setpoints"
+    ORBIT = "flies a circle"
+
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """A circle that a client requests."""
+
+    centre_ned_m: Triple
+    radius_m: float  # negative: anticlockwise
+    speed_mps: float
+    yaw: int  # ORBIT_YAW_BEHAVIOUR
 
 
 @dataclass(frozen=True, slots=True)

@@ -203,6 +203,9 @@ class ArduCopter(Firmware):
                 return _INVALID_PARAM1 + number, None
         if item.command not in _PLACES | _ACTS:
             return _UNSUPPORTED, None
+        for number, degrees, most_deg in ((4, item.x * 1e-7, 90.0), (5, item.y * 1e-7, 180.0)):
+            if item.command in _PLACES and abs(degrees) > most_deg:
+                return _INVALID_PARAM1 + number, None
         if item.command in _PLACES and not (item.frame in _PLACE_FRAMES and math.isfinite(item.z)):
             return _UNSUPPORTED_FRAME, None
         return None

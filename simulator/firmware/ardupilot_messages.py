@@ -10,7 +10,6 @@ from offboard.model.frames import euler_from_quaternion
 from simulator.autopilot.mission import Kind
 from simulator.autopilot.values import AttitudeSetpoint
 from simulator.firmware.ardupilot_tables import BY_HAND, BY_POSITION
-from simulator.geodesy import GRAVITY_MPS2
 from simulator.mavlink import messages
 from simulator.mavlink.view import View, fit
 
@@ -101,9 +100,7 @@ def rc_channels(view: View) -> Sequence[Any]:
 
 def raw_imu(view: View) -> Sequence[Any]:
     """True specific force in mg, estimated rates in mrad/s, magnetic field of SITL in mgauss."""
-    force = (fit(value / GRAVITY_MPS2 * 1e3, 16) for value in view.specific_force)
-    rates = (fit(value * 1e3, 16) for value in view.autopilot.state.estimate.rates_frd_radps)
-    return (view.time_us, *force, *rates, 224, 80, -528, 0, 2500)
+    return (view.time_us, *view.imu_counts, 224, 80, -528, 0, 2500)
 
 
 def servo_output_raw(view: View) -> Sequence[Any]:

@@ -260,8 +260,10 @@ PX4 = Px4(
     never_sent=telemetry.NEVER_SENT,
     interval_refusal=Result.FAILED,
     request_refusal=Result.DENIED,
-    # partial lists have no handler, RC channels no RC_MAP_*
-    ignored=frozenset({"MISSION_WRITE_PARTIAL_LIST", "RC_CHANNELS_OVERRIDE"}),
+    # RC channels have no RC_MAP_*, the others no handler
+    ignored=frozenset(
+        {"MISSION_WRITE_PARTIAL_LIST", "RC_CHANNELS_OVERRIDE", "AUTOPILOT_VERSION_REQUEST"}
+    ),
     target_component_checked=True,
     never_to_all=frozenset({"COMMAND", "MISSION", "PARAM"}),
     text_suffix="\t",

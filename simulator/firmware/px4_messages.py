@@ -21,7 +21,9 @@ COMPANION_RATES_HZ = {
     "ODOMETRY": 30.0,
     "ALTITUDE": 10.0,
     "ATTITUDE_TARGET": 10.0,
+    "DISTANCE_SENSOR": 10.0,
     "POSITION_TARGET_LOCAL_NED": 10.0,
+    "SERVO_OUTPUT_RAW": 10.0,
     "TIMESYNC": 10.0,
     "VFR_HUD": 10.0,
     "GPS_RAW_INT": 8.0,
@@ -50,20 +52,22 @@ GROUND_RATES_HZ = {
     "LOCAL_POSITION_NED": 1.0,
     "SYS_STATUS": 1.0,
     "EXTENDED_SYS_STATE": 1.0,
+    "SERVO_OUTPUT_RAW": 1.0,
     "SYSTEM_TIME": 1.0,
     "MISSION_CURRENT": 1.0,
     "ESTIMATOR_STATUS": 0.5,
     "BATTERY_STATUS": 0.5,
     "CURRENT_MODE": 0.5,
+    "DISTANCE_SENSOR": 0.5,
     "HOME_POSITION": 0.5,
 }
 
 
 ON_EVENT = frozenset({"MISSION_CURRENT", "MISSION_ITEM_REACHED"})
 NEVER_SENT = frozenset({
-    8, 25, 26, 62, 65, 69, 76, 93, 106, 112, 116, 124, 129, 137, 143, 149,
-    192, 225, 231, 233, 235, 246, 250, 251, 253, 254, 261, 263, 264, 265, 280, 281, 283,
-    284, 285, 286, 290, 291, 300, 330, 339, 350, 360, 361, 371, 372, 375, 380, 395, 397, 435,
+    8, 25, 62, 65, 69, 76, 93, 106, 112, 116, 124, 129, 137, 143, 149,
+    192, 225, 231, 233, 235, 246, 250, 251, 253, 254, 261, 263, 265, 280, 281, 283,
+    284, 285, 286, 290, 291, 300, 330, 339, 350, 360, 361, 371, 372, 380, 395, 397, 435,
     12900, 12901, 12904, 12918, 12920,
 })  # fmt: skip
 
@@ -140,6 +144,16 @@ def servo_output_raw(view: View) -> Sequence[Any]:
     return (view.time_us & 0xFFFFFFFF, 0, *(width_us,) * 4, *(900,) * 12)
 
 
+def actuator_output_status(view: View) -> Sequence[Any]:
+    """The pulse widths of SERVO_OUTPUT_RAW."""
+    return (view.time_us, 16, (*servo_output_raw(view)[2:], *(0.0,) * 16))
+
+
+def scaled_imu(view: View) -> Sequence[Any]:
+    """The values of HIGHRES_IMU, but in mg, mrad/s and mgauss."""
+    return (view.time_ms, *view.imu_counts, 210, 0, 430, 1500)
+
+
 def highres_imu(view: View) -> Sequence[Any]:
     """True specific force in body axes and estimated rates; PX4 sends the pressure in Pa."""
     nav = view.autopilot.state.estimate
@@ -175,6 +189,13 @@ def hil_state_quaternion(view: View) -> Sequence[Any]:
         airspeed,
         *(fit(value / GRAVITY_MPS2 * 1e3, 16) for value in truth.acceleration_ned_mps2),
     )
+
+
+def flight_information(view: View) -> Sequence[Any]:
+    """Times of arming and takeoff, in us since boot; 0 while disarmed."""
+    health, armed = view.autopilot.health, view.autopilot.commander.armed
+    since_s = (health.armed_s, health.took_off_s) if armed else (0.0, 0.0)
+    return (view.time_ms, *(round(time_s * 1e6) for time_s in since_s), 0)
 
 
 def estimator_status(view: View) -> Sequence[Any]:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from offboard.model.frames import wrap_pi
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Request
-from simulator.autopilot.values import Asked, Behaviour, Result, Triple, info
+from simulator.autopilot.values import Asked, Behaviour, Circle, Result, Triple, critical, info
 from simulator.geodesy import down_m, to_metres
 from simulator.mavlink.codec import id_of, name_of
 from simulator.mavlink.outbox import Outbox
@@ -25,6 +25,7 @@ _HEIGHT_MAX_M = 83_000.0  # greatest height of home: ArduPilot's LOCATION_ALT_MA
 _RELATIVE = 3  # MAV_FRAME
 _CHANGE_MODE = 1.0  # MAV_DO_REPOSITION_FLAGS
 _MOTORS = 4
+_RADIUS_MAX_M = 1000.0  # of an orbit: PX4's MC_ORBIT_RAD_MAX
 _MISSION_PLANNER = 190  # MAV_COMP_ID_MISSIONPLANNER, the component id of ground stations
 
 
@@ -133,7 +134,7 @@ class Commands:
 
     def _reposition(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_DO_REPOSITION: fly to a place and hold it. The present position replaces
-        coordinates that are not finite."""
+        coordinates that are not finite. For PX4 the height is above mean sea level in any frame."""
         ardupilot, mode = autopilot.firmware.ardupilot_commands, autopilot.firmware.reposition_mode
         there = ardupilot and autopilot.commander.mode.name == mode
         if command.params[1] != _CHANGE_MODE and not there:
@@ -150,10 +151,32 @@ class Commands:
         result = autopilot.handle("mode", Request(mode))
         if result is Result.ACCEPTED and autopilot.commander.armed:
             yaw_rad = yaw_rad if math.isfinite(yaw_rad) else math.nan
-            place = self._place(latitude, longitude, height_m, command.frame or 0)
+            frame = (ardupilot and command.frame) or 0
+            place = self._place(latitude, longitude, height_m, frame)
             autopilot.go_to(place, yaw_rad)
             if math.isfinite(speed_mps):
                 autopilot.guidance.cruise_mps = speed_mps
+        return result
+
+    def _change_altitude(self, autopilot: Autopilot, command: Command) -> Result:
+        """MAV_CMD_DO_CHANGE_ALTITUDE: DO_REPOSITION of PX4 with a height only."""
+        params = (math.nan, _CHANGE_MODE, *(math.nan,) * 4, command.params[0])
+        return self._reposition(autopilot, replace(command, params=params, frame=None))
+
+    def _orbit(self, autopilot: Autopilot, command: Command) -> Result:
+        """MAV_CMD_DO_ORBIT: fly a circle. The present position replaces coordinates that are not
+        finite."""
+        result = autopilot.handle("orbit")
+        if result is Result.ACCEPTED:
+            given = zip(command.params, (1.0, 1.0, 0.0), strict=False)
+            radius_m, speed_mps, yaw = (a if math.isfinite(a) else default for a, default in given)
+            if not 1.0 <= abs(radius_m) <= _RADIUS_MAX_M:
+                autopilot.commander.texts.append(critical("Orbit radius limit exceeded"))
+                radius_m = 1.0
+            speed_mps = min(abs(speed_mps), 10.0, math.sqrt(2.0 * abs(radius_m)))
+            latitude, longitude, height_m = command.params[4:7]
+            centre = self._place(latitude, longitude, height_m, 0)
+            autopilot.guidance.circle = Circle(centre, radius_m, speed_mps, int(yaw))
         return result
 
     def go_to(self, place: tuple[float, float, float], frame: int) -> bool:
@@ -309,12 +332,14 @@ HANDLERS: dict[int, Callable[[Commands, Autopilot, Command], Result | None]] = {
     20: lambda _, autopilot, __: autopilot.handle("return"),  # NAV_RETURN_TO_LAUNCH
     21: lambda _, autopilot, __: autopilot.handle("land"),  # NAV_LAND
     22: Commands._takeoff,  # NAV_TAKEOFF
+    34: Commands._orbit,  # DO_ORBIT
     115: Commands._turn,  # CONDITION_YAW
     176: Commands._set_mode,  # DO_SET_MODE
     178: Commands._change_speed,  # DO_CHANGE_SPEED
     179: Commands._set_home,  # DO_SET_HOME
     183: Commands._set_servo,  # DO_SET_SERVO
     185: Commands._terminate,  # DO_FLIGHTTERMINATION
+    186: Commands._change_altitude,  # DO_CHANGE_ALTITUDE
     192: Commands._reposition,  # DO_REPOSITION
     195: Commands._face,  # DO_SET_ROI_LOCATION
     197: Commands._face,  # DO_SET_ROI_NONE

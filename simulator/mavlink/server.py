@@ -268,5 +268,6 @@ HANDLERS: dict[str, Callable[[Server, Message], None]] = {
     "SETUP_SIGNING": Server._setup_signing,
     "LOG_REQUEST_LIST": Server._log_request_list,
     "REQUEST_DATA_STREAM": Server._request_data_stream,
+    "AUTOPILOT_VERSION_REQUEST": lambda server, _: server.outbox.send_now("AUTOPILOT_VERSION"),
     "FILE_TRANSFER_PROTOCOL": Server._file_transfer,
 }

@@ -97,6 +97,13 @@ class View:
         return forward, right, down
 
     @property
+    def imu_counts(self) -> list[int]:
+        """True specific force in mg and estimated rates in mrad/s, FRD."""
+        per_mg, rates = GRAVITY_MPS2 * 1e-3, self.autopilot.state.estimate.rates_frd_radps
+        force = (value / per_mg for value in self.specific_force)
+        return [fit(value, 16) for value in (*force, *(rate * 1e3 for rate in rates))]
+
+    @property
     def landed_state(self) -> int:
         """MAV_LANDED_STATE: 1 on ground, 2 in air, 3 taking off, 4 landing."""
         if self.wrong_landed_state is not None:

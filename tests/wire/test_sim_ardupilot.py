@@ -21,6 +21,7 @@ from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.px4 import PX4
 
 AUTO, GUIDED, LAND, BRAKE, THROW = 3, 4, 9, 17, 18
+HOLD = 0x03040000  # of PX4
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
 HOVER = 0.3655
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -58,6 +59,9 @@ def test_arducopter_sends_heartbeat_timesync_and_home_unrequested() -> None:
         "GPS_GLOBAL_ORIGIN": 1,
         "HOME_POSITION": 1,
     }
+    vehicle.send(mavlink.MAVLink_autopilot_version_request_message(1, 1))  # of Mission Planner
+    vehicle.run(0.02)
+    assert len(vehicle.of("AUTOPILOT_VERSION")) == 1
 
 
 def test_arducopter_streams_a_requested_group_also_after_an_interval_of_0() -> None:
@@ -356,6 +360,20 @@ def test_requested_speed_holds_until_another_kind_of_setpoint() -> None:
     assert fastest_mps(bench, 6.0) > 7.0
 
 
+def test_arducopter_integrates_an_acceleration_to_a_velocity() -> None:
+    """The real one had flown 2.0 m after 3 s of setpoints; without them it flies on for 3 s."""
+    bench = flying()
+    fields = (0, 1, 1, 1, 0xC3F, *(0.0,) * 6, 0.5, *(0.0,) * 4)
+    setpoint = mavlink.MAVLink_set_position_target_local_ned_message(*fields)
+    bench.run(3.0, lambda: bench.send(setpoint), 0.1)
+    assert bench.place == pytest.approx((2.0, 0.0, -5.0), abs=0.4)
+    bench.run(2.8)
+    assert bench.velocity == pytest.approx((2.9, 0.0, 0.0), abs=0.3)
+    assert bench.place == pytest.approx((8.4, 0.0, -5.0), abs=0.9)
+    bench.run(4.0)
+    assert bench.velocity == pytest.approx((0.0, 0.0, 0.0), abs=0.3)
+
+
 def test_arducopter_reposition_moves_as_on_the_real_one() -> None:
     """Expected are metres from the start after each second. Only COMMAND_INT is accepted."""
     bench = flying()
@@ -375,6 +393,7 @@ def test_arducopter_reposition_moves_as_on_the_real_one() -> None:
     ("firmware", "x", "frame", "result"),
     [
         (PX4, 2**31 - 1, ABSOLUTE, ACCEPTED),  # "no place": the present one
+        (PX4, 2**31 - 1, RELATIVE, ACCEPTED),  # above mean sea level, whatever the frame
         (ARDUPILOT, 2**31 - 1, RELATIVE, DENIED),
         (ARDUPILOT, 950_000_000, RELATIVE, DENIED),
     ],
@@ -383,7 +402,7 @@ def test_reposition_without_a_valid_place_does_not_move(
     firmware: Firmware, x: int, frame: int, result: int
 ) -> None:
     bench = flying(firmware)
-    up_m = 5.0 + (bench.instance.autopilot.firmware.origin[2] if frame == ABSOLUTE else 0.0)
+    up_m = 5.0 + (bench.instance.autopilot.firmware.origin[2] if firmware is PX4 else 0.0)
     assert command_int(bench, frame, 192, -1.0, 1, 0, NAN, x, x, up_m) == result
     bench.run(3.0)
     assert bench.place == pytest.approx((0.0, 0.0, -5.0), abs=0.5)
@@ -467,6 +486,27 @@ def test_px4_faces_its_goal_and_then_takes_the_requested_yaw() -> None:
     assert reposition(bench, 1.0, 30.0, amsl_m, ABSOLUTE) == ACCEPTED  # nearer than NAV_ACC_RAD
     bench.run(4.0)
     assert off_deg(bench, -45.0) < 3.0
+
+
+@pytest.mark.parametrize("radius_m", [10.0, -10.0])
+def test_px4_flies_an_orbit_with_its_nose_to_the_centre(radius_m: float) -> None:
+    """The real one was 9.6 to 10.5 m from the centre and flew 1.5 to 1.7 m/s when 2 were asked."""
+    bench = aloft(height_m=3.0)
+    amsl_m = bench.instance.autopilot.firmware.origin[2] + 3.0
+    x, y = (round(value * 1e7) for value in degrees(bench, 0.0, 0.0))
+    assert command_int(bench, ABSOLUTE, 34, radius_m, 2.0, 0.0, NAN, x, y, amsl_m) == ACCEPTED
+    bench.run(20.0)
+    assert bench.of("HEARTBEAT")[-1][1].custom_mode == 0x01030000
+    (north, east, down), (v_north, v_east, _) = bench.place, bench.velocity
+    assert math.hypot(north, east) == pytest.approx(10.0, abs=0.7)
+    assert down == pytest.approx(-3.0, abs=0.4)
+    turned = (north * v_east - east * v_north) / math.hypot(north, east)
+    assert turned == pytest.approx(math.copysign(1.6, radius_m), abs=0.25)
+    assert off_deg(bench, math.degrees(math.atan2(-east, -north))) < 12.0
+    assert bench.command(186, amsl_m + 4.0) == [ACCEPTED]  # ends the orbit
+    bench.run(8.0)
+    assert bench.mode == HOLD
+    assert bench.height_m == pytest.approx(7.0, abs=0.5)
 
 
 @pytest.mark.parametrize(

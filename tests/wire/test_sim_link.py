@@ -144,6 +144,26 @@ def test_message_interval_can_be_stopped_restored_and_read() -> None:
         assert bench.of("MESSAGE_INTERVAL")[-1][1].interval_us == shown_us
 
 
+def test_px4_sends_imu_outputs_and_times_of_the_flight_on_request() -> None:
+    """MAVSDK reads them as scaled IMU, actuator output status and flight information."""
+    bench = Bench()
+    bench.fly_offboard()
+    assert [bench.command(512, number) for number in (26, 375, 264)] == [[0]] * 3
+    imu, outputs, times = (
+        bench.of(kind)[-1][1]
+        for kind in ("SCALED_IMU", "ACTUATOR_OUTPUT_STATUS", "FLIGHT_INFORMATION")
+    )
+    assert (imu.xacc, imu.yacc, imu.zacc) == pytest.approx((0, 0, -1000), abs=60)
+    assert 1300.0 < outputs.actuator[0] == outputs.actuator[3] < 1700.0
+    assert (outputs.actuator[4], outputs.actuator[16]) == (900.0, 0.0)
+    assert times.arming_time_utc < times.takeoff_time_utc < times.time_boot_ms * 1000
+    assert times.arming_time_utc == pytest.approx(5.6e6, abs=0.1e6)
+    bench.command(400, 0, 21196)
+    bench.command(512, 264)
+    times = bench.of("FLIGHT_INFORMATION")[-1][1]
+    assert (times.arming_time_utc, times.takeoff_time_utc) == (0, 0)
+
+
 # -- time, files -----------------------------------------------------------------------------
 
 

@@ -95,11 +95,12 @@ def test_a_mission_is_downloaded_as_uploaded_and_cleared() -> None:
         assert bench.of("MISSION_COUNT")[-1][1].count == 0
 
 
-def test_arducopter_refuses_an_item_with_nan_or_an_unknown_command() -> None:
+def test_arducopter_refuses_an_item_with_nan_an_unknown_command_or_a_wrong_latitude() -> None:
     bench = Bench(firmware=ARDUPILOT)
     assert upload(bench, [place(WAYPOINT, 12, 0, 4, NAN)]) == 6
     assert upload(bench, [act(SPEED, 1, 2, 0, NAN)]) == 9
     assert upload(bench, [act(31_000)]) == 3
+    assert upload(bench, [place(WAYPOINT, 1.5e7, 0, 4)]) == 10  # 135 degrees further north
     assert upload(bench, [place(WAYPOINT, 12, 0, 4)]) == 0
 
 
