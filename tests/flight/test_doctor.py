@@ -400,6 +400,13 @@ def test_silent_vehicle_is_not_ready_to_fly(start: Start | None) -> None:
     assert not verdict({"rates": rates}, complete=True).startswith("ready to fly")
 
 
+def test_a_missing_position_has_one_cause() -> None:
+    """Not also that it is slower than requested."""
+    silent = {"fault": "silent_message", "message": "LOCAL_POSITION_NED"}
+    (missing,) = bench(faults=[silent]).check("rates")["rates"]
+    assert missing.found.startswith("no LOCAL_POSITION_NED arrives")
+
+
 def test_another_type_of_vehicle_has_no_other_rows() -> None:
     """Its telemetry and its parameters mean something else."""
     rover = partial(heartbeats(type=10), 0.0)
