@@ -84,11 +84,15 @@ def _names(pids: Iterable[int]) -> Iterator[str]:
 
 
 def disk(seen: Observation) -> Iterable[Finding]:
-    """Free space for the log of a flight."""
+    """Whether the log of a flight can be written, and free space for it."""
     place = seen.directory.absolute()
     try:
-        free = shutil.disk_usage(next(p for p in (place, *place.parents) if p.exists())).free
+        place = next(each for each in (place, *place.parents) if each.exists())
+        free = shutil.disk_usage(place).free
     except OSError:
+        return
+    if not (place.is_dir() and os.access(place, os.W_OK)):
+        yield blocks(f"{place} cannot be written", "choose another directory with --out")
         return
     figures = f"{free / 1e9:.1f} GB free in {seen.directory}"
     if free < LEAST_FREE_BYTES:
