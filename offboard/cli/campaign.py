@@ -113,7 +113,8 @@ def conclude(summary: Summary, flown: Campaign) -> None:
     if summary.kept:
         kept = counted(len(summary.kept), "flight")
         say(f"kept: {kept}; `{typed('offboard', 'report', summary.kept[0])}` shows one")
-    say(f"written: {directory / 'campaign.csv'} and campaign.html")
+    if (directory / "campaign.html").exists():  # else `stopped` says why
+        say(f"written: {directory / 'campaign.csv'} and campaign.html")
     if summary.stopped or summary.mine_missing:
         why = summary.stopped or "interrupted"
         again = typed("--out", directory)

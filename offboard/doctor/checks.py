@@ -195,9 +195,9 @@ def rates(seen: Observation) -> Iterable[Finding]:
     ]
     if not seen.rates_requested:
         yield ok(f"{figures}; not requested, since the vehicle is armed")
-    elif slow:
+    elif slow and seen.vehicle.has_state:  # else the preflight list says what is missing
         yield warn(f"slower than requested: {', '.join(slow)}", seen.known_dialect.slow_hint)
-    else:
+    elif not slow:
         yield ok(figures)
 
 

@@ -84,14 +84,14 @@ def _names(pids: Iterable[int]) -> Iterator[str]:
 
 
 def disk(seen: Observation) -> Iterable[Finding]:
-    """Free space for the log of a flight."""
+    """Whether the log of a flight can be written, and free space for it."""
     place = seen.directory.absolute()
-    try:
-        free = shutil.disk_usage(next(p for p in (place, *place.parents) if p.exists())).free
-    except OSError:
-        return
+    place = next(each for each in (place, *place.parents) if os.access(each, os.F_OK))
+    free = shutil.disk_usage(place).free
     figures = f"{free / 1e9:.1f} GB free in {seen.directory}"
-    if free < LEAST_FREE_BYTES:
+    if not (place.is_dir() and os.access(place, os.W_OK)):
+        yield blocks(f"{place} cannot be written", "choose another directory with --out")
+    elif free < LEAST_FREE_BYTES:
         yield warn(f"{figures}; a flight lands when its log cannot be written", "free some space")
     else:
         yield ok(figures)

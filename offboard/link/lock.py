@@ -13,7 +13,7 @@ import struct
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from offboard.documents.errors import Unavailable, UserError
@@ -33,9 +33,10 @@ def file_lock(path: Path, what: str) -> Iterator[None]:
     """Hold a lock on the file at `path`. The file is not removed: it keeps the id of the last
     process that held the lock. `what` names in errors what the lock protects. Raises UserError."""
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     except OSError as error:
-        raise UserError(f"the lock {path} cannot be opened: {error.strerror}") from None
+        raise UserError(f"the lock of the {what} cannot be opened: {error.strerror}") from None
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -98,6 +99,4 @@ def connection_lock(connection: str, system_id: int | None = None) -> AbstractCo
 def directory_lock(place: Path) -> AbstractContextManager[None]:
     """The lock that allows one service for each directory of flights, because two would overwrite
     each other's rolling log."""
-    with suppress(OSError):  # if this fails, opening the lock reports why
-        place.mkdir(parents=True, exist_ok=True)
     return file_lock(place / "service.lock", f"directory {place} (--out)")

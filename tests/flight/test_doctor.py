@@ -400,6 +400,13 @@ def test_silent_vehicle_is_not_ready_to_fly(start: Start | None) -> None:
     assert not verdict({"rates": rates}, complete=True).startswith("ready to fly")
 
 
+def test_a_missing_position_has_one_cause() -> None:
+    """Not also that it is slower than requested."""
+    silent = {"fault": "silent_message", "message": "LOCAL_POSITION_NED"}
+    (missing,) = bench(faults=[silent]).check("rates")["rates"]
+    assert missing.found.startswith("no LOCAL_POSITION_NED arrives")
+
+
 def test_another_type_of_vehicle_has_no_other_rows() -> None:
     """Its telemetry and its parameters mean something else."""
     rover = partial(heartbeats(type=10), 0.0)
@@ -547,7 +554,9 @@ def test_doctor_ends_in_time_despite_hanging_checks(
     assert rows["computer"][0].level is Level.WAIT
 
 
-def test_doctor_warns_of_a_full_disk_and_a_slow_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_warns_of_a_full_disk_and_a_slow_computer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The disk is full, a decision is slow, and the process wakes up late."""
     monkeypatch.setattr(computer, "LEAST_FREE_BYTES", 10**18)
     monkeypatch.setattr(computer, "_not_compiled", lambda: 0)
@@ -561,3 +570,6 @@ def test_doctor_warns_of_a_full_disk_and_a_slow_computer(monkeypatch: pytest.Mon
     found = " ".join(finding.found for finding in rows["computer"])
     assert "a decision takes 40.0 ms of 50 ms" in found
     assert "wakes up at most 30.0 ms late" in found
+    (tmp_path / "file").touch()
+    seen.directory = tmp_path / "file/flights"
+    assert run.examine(run.chosen(["disk"]), seen)["disk"][0].level is Level.BLOCKS

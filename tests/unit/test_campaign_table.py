@@ -20,9 +20,11 @@ from offboard.campaign.cases import Case
 from offboard.campaign.document import CampaignFile, Promises
 from offboard.campaign.flight import LOWEST, Job, terms
 from offboard.campaign.results import Record
-from offboard.campaign.run import Campaign
+from offboard.campaign.run import Campaign, Summary
 from offboard.campaign.table import TABLE_METRICS, Group, groups, page, row_of, show
 from offboard.campaign.workers import ConnectedVehicle
+from offboard.cli.campaign import conclude
+from offboard.documents.errors import UserError
 
 LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")
 SCENARIOS = ("calm", "all_together")
@@ -121,6 +123,15 @@ def test_campaign_page_opens_offline_and_shows_all_groups(
             assert opened.unreadable() == opened.problems == []
     for words in (*LAWS, *SCENARIOS, WHY, "3 of 3 failed", "<i>calm</i>", "--seed 3"):
         assert words in told, words
+
+
+def test_a_table_that_could_not_be_written_is_not_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    campaign = Campaign(CampaignFile(references=("hover",)), "x", tmp_path)
+    with pytest.raises(UserError, match="No space left: 1 of 1 flight is missing"):
+        conclude(Summary(1, [], 1, "No space left", []), campaign)
+    assert "campaign.html" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

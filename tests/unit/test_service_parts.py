@@ -214,6 +214,9 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
     ours = f"has the directory {tmp_path}/new.*: process {os.getpid()}$"
     with directory_lock(tmp_path / "new"), pytest.raises(Unavailable, match=ours):
         directory_lock(tmp_path / "new").__enter__()
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=r"file/new \(--out\) cannot be opened: Not a directory"):
+        directory_lock(tmp_path / "file/new").__enter__()
 
 
 def test_lock_counts_as_held_if_its_holder_may_not_be_asked(
