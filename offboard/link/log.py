@@ -77,12 +77,15 @@ class FlightLog:
         # O_APPEND, because another process may continue the log
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
         descriptor = os.open(self.path, flags, 0o666)
+        configuration = self.directory / "flight.yaml"
         try:
-            with (self.directory / "flight.yaml").open("x", encoding="utf-8") as file:
+            with configuration.open("x", encoding="utf-8") as file:
                 file.write(self.configuration)
-        except OSError:
+        except OSError as error:  # the flight does not begin, and leaves no file
             os.close(descriptor)
-            self.path.unlink()  # an empty log would remain although the flight does not begin
+            self.path.unlink()
+            if not isinstance(error, FileExistsError):
+                configuration.unlink()
             raise
         self.descriptor = descriptor
 

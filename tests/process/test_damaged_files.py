@@ -132,6 +132,7 @@ LINK = "--connect udpin:127.0.0.1:PORT --signing-key key --out x"
     ("command", "holds_bytes", "code", "kept"),
     [
         (f"fly {LINK}", 0, 2, {"key", "state"}),
+        ("fly --sitl --out x", 100, 2, {"key", "x"}),
         # the service manager starts it again, and it waits for room
         (f"daemon {LINK}", 10, 3, {"key", "state", "x"}),
         (f"identify -o x.yaml {RECORDING}", 100, 2, {"key"}),
@@ -146,6 +147,7 @@ def test_commands_on_a_full_disk_leave_no_partial_file(
     assert (ended, said.count("\n")) == (code, 1)
     assert "File too large" in said
     assert {path.name for path in tmp_path.iterdir()} == kept
+    assert not list(tmp_path.glob("x/flight.*"))
 
 
 # --- an output that takes nothing ---
