@@ -13,7 +13,7 @@ from typing import Any
 
 import faults
 import pytest
-from pair import Filter, Pair
+from pair import LEAN_COPTER, Filter, Pair
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from watch import (
     HIGH,
@@ -245,6 +245,11 @@ def asks_again(pair: Pair) -> None:
 def asks_each_second(pair: Pair) -> None:
     """Requests to land that are lost are repeated each second; an accepted one is not repeated."""
     assert len(pair.landings) == 4
+
+
+def asks_every_three_seconds(pair: Pair) -> None:
+    """An accepted request to land that has no effect is repeated."""
+    assert len(pair.landings) == 5
 
 
 def asks_once(pair: Pair) -> None:
@@ -493,6 +498,11 @@ ROWS = {
     "landing refused": ends(
         "the vehicle's own failsafe flew it, in POSCTL; the vehicle said: ",
         landed_by_its_failsafe, ended_by="link", firmware=faults.refusing("land", "No."),
+    ),
+    "landing accepted without effect": aborts(
+        Phase.FAILED, "not landed and disarmed after 15 s", asks_every_three_seconds, armed=True,
+        fly=copter.hover, limits={"land_s": 15.0},
+        firmware=replace(LEAN_COPTER, rules=(Rule("land"), *LEAN_COPTER.rules)),
     ),
     "on the ground by its land detector, the vehicle does not disarm": flies(
         asked_to_disarm_without_force, fly=hover_without_disarming
