@@ -206,6 +206,7 @@ class Flight(FlightState):
             ours=self.phase not in BEFORE_FLIGHT | ENDS and authority.is_ours,
             flying=self.vehicle.armed,
             reported_s=authority.arrived_s,
+            turned_s=self.host_s,
             holding=self.phase is Phase.HOLD,
             landing=self.phase is Phase.LAND,
             setpoint_loss=authority.setpoint_loss,

@@ -113,7 +113,7 @@ class TakeOver:
         self._session.senders.set_vehicle(known.vehicle, peer)
         assert self._session.dialect is not None
         self._dialect = self._session.dialect
-        self._recovery = Recovery(self._dialect, known, clock.monotonic_s(), beat["sent_s"])
+        self._recovery = Recovery(self._dialect, known, clock.monotonic_s())
         self._text_id = 0
 
     def run(self, reason: str) -> None:

@@ -33,7 +33,7 @@ UNHEARD_MAX = 3  # most requests to a vehicle of which nothing is heard
 HOLD_S = 5.0  # from hold to land
 ACKNOWLEDGED_S = 3.0  # from the first report of hold to its acknowledgement, at most
 LONGEST_S = 300.0
-EARLY_S = 0.3  # the newest setpoint was sent before the newest beat, and may have been lost
+EARLY_S = 0.3  # the newest setpoint was sent before the newest turn, and may have been lost
 SINK_MPS = 0.2  # a vehicle lands if it has had this downward speed within SINK_S
 SINK_S = 3.0  # longer than COM_DISARM_LAND, 2 s, after which it is disarmed
 # Without beats the supervisor acts EARLIER_S before the autopilot's own failsafe, so that only one
@@ -47,6 +47,7 @@ class Supervised:
 
     `ours`: whether the vehicle shows the mode of our setpoints, or one that we requested, in a
     report that arrived at `reported_s` (`clock.monotonic_s`); the supervisor judges its age.
+    `turned_s`: when the turn began that reports this and may have sent a setpoint.
     `flying`: whether the vehicle is armed. `holding`: whether hold was requested, so that the mode
     hold is ours, too. `landing`: whether land was requested. `setpoint_loss`: what the autopilot
     does without setpoints. `sticks`: whether it receives a pilot's sticks. `setpoints_missing`:
@@ -56,6 +57,7 @@ class Supervised:
     ours: bool
     flying: bool
     reported_s: float = -math.inf
+    turned_s: float = -math.inf
     holding: bool = False
     landing: bool = False
     setpoint_loss: SetpointLoss = NEVER
@@ -69,17 +71,17 @@ class Supervised:
 
 
 class Recovery:
-    """One recovery, which begins at `began_s`. The controller sent its newest beat at `beat_s`, and
-    reported `known`. Times are those of `clock.monotonic_s`.
+    """One recovery, which begins at `began_s`. `known` is what the controller reported last. Times
+    are those of `clock.monotonic_s`.
 
     `end_reason` says how the recovery ended, empty until then; `news` are sentences for the user.
     """
 
-    def __init__(self, dialect: Dialect, known: Supervised, began_s: float, beat_s: float) -> None:
+    def __init__(self, dialect: Dialect, known: Supervised, began_s: float) -> None:
         self._dialect, self._known = dialect, known
         self._hold_s = 0.0 if known.landing else HOLD_S
         self._began_s = began_s
-        missing_s = beat_s + known.setpoint_loss.after_s - EARLY_S
+        missing_s = known.turned_s + known.setpoint_loss.after_s - EARLY_S
         self._loses_s = -math.inf if known.setpoints_missing else missing_s
         self._sticks = known.sticks
         self._mode: str | None = None
