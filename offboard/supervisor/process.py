@@ -182,10 +182,7 @@ class TakeOver:
 
 def _known(vehicle: Mapping[str, Any], setpoint_loss: Mapping[str, Any], **more: Any) -> Supervised:
     """Make a `Supervised` of the JSON of a beat."""
-    modes = tuple(setpoint_loss["modes"])
-    return Supervised(
-        VehicleFound(**vehicle), setpoint_loss=SetpointLoss(setpoint_loss["after_s"], modes), **more
-    )
+    return Supervised(VehicleFound(**vehicle), setpoint_loss=SetpointLoss(**setpoint_loss), **more)
 
 
 def _link(descriptors: list[int], stream: str, *, listens: bool) -> Link:
