@@ -100,9 +100,9 @@ def says_once_that_nothing_is_heard(pair: Pair) -> None:
     assert list(announced(pair))[:-1] == ["waiting: nothing is heard on this link"]
 
 
-def says_the_change(pair: Pair) -> None:
+def says_each_change_once(pair: Pair) -> None:
     said = [each for each in announced(pair) if "COM_OF_LOSS_T" in each]
-    assert said == ["COM_OF_LOSS_T was changed from 1 to 2"]
+    assert said == [f"COM_OF_LOSS_T was changed from {a}" for a in ("1 to 2", "2 to 1")]
 
 
 def names_the_key_soon(pair: Pair) -> None:
@@ -370,8 +370,8 @@ def signed_by_another() -> Pair:
 
 def set_parameter(pair: Pair) -> None:
     codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
-    message = mavlink.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", 2.0, 9)
-    for _ in range(2):
+    for value in (2.0, 2.0, 1.0, 2.0, 1.0):
+        message = mavlink.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", value, 9)
         pair.instance.feed(message.pack(codec))
 
 
@@ -516,8 +516,8 @@ ROWS = {
     "PX4 leaves the landing mode as it disarms": flies(
         fly=partial(px4.hover, "reference.duration_s=3.3")
     ),
-    "a ground station sets a parameter in flight, twice": flies(
-        says_the_change, fly=px4.hover, at=tracking(set_parameter),
+    "ground stations set a parameter in flight, in turn": flies(
+        says_each_change_once, fly=px4.hover, at=tracking(set_parameter),
     ),
     "takeoff by command": flies(took_off_by_command, fly=copter.hop),
     "takeoff refused": ends(
