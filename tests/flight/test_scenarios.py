@@ -13,7 +13,7 @@ from typing import Any
 
 import faults
 import pytest
-from pair import LEAN_COPTER, Filter, Pair
+from pair import LEAN_COPTER, Filter, Pair, frame_id, frames_of
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from watch import (
     HIGH,
@@ -346,6 +346,14 @@ def begins_to_arrive(kind: int, at_s: float) -> Filter:
     return lambda time_s, datagrams: datagrams if time_s >= at_s else rest(time_s, datagrams)
 
 
+def late_positions() -> Filter:
+    """Return a filter that delays positions by 0.2 s, more than the observer permits."""
+    late = faults.delivering(lambda _, frame: [0.2 * (frame_id(frame) == faults.POSITION)])
+    return lambda time_s, datagrams: late(
+        time_s, [frame for datagram in datagrams for frame in frames_of(datagram)]
+    )
+
+
 def lose_two_heartbeats(pair: Pair) -> None:
     """Lose two HEARTBEATs after the next one, and from now on every CURRENT_MODE."""
     pair.down = faults.without(faults.CURRENT_MODE)
@@ -437,6 +445,14 @@ ROWS = {
     "the land detector is not heard": refusal(
         r"not ready: it does not report whether it flies \(EXTENDED_SYS_STATE\)", nothing_sent,
         down=faults.without(faults.EXTENDED_SYS_STATE), limits=HEALTH_IN_5_S,
+    ),
+    "positions arrive 0.2 s later than attitudes": refusal(
+        "not ready: no LOCAL_POSITION_NED arrives", nothing_sent, down=late_positions(),
+        limits=HEALTH_IN_5_S,
+    ),
+    "positions begin to arrive 0.2 s later than attitudes": aborts(
+        Phase.FAILED, "no new LOCAL_POSITION_NED for 0.[56] s", fly=px4.hover, failsafes=["blind"],
+        at=tracking(faults.downlink(late_positions())),
     ),
     "the vehicle receives nothing": refusal(
         "not ready: no TIMESYNC request was answered for 5 s: does the vehicle receive them?",
