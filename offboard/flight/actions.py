@@ -8,7 +8,7 @@ from offboard.flight import decision, outbox
 from offboard.flight.authority import PilotSwitch, Standing
 from offboard.flight.failsafe import telemetry_old
 from offboard.flight.ground_contact import STANDING_S, STILL_ARMED
-from offboard.flight.phases import BEFORE_FLIGHT, FLYING, OUTAGE_MAX_S, TRACKING, Phase
+from offboard.flight.phases import BEFORE_FLIGHT, ENDING, FLYING, OUTAGE_MAX_S, TRACKING, Phase
 from offboard.flight.preflight import other_sender
 from offboard.flight.state import LEVEL_DIRECTION, FlightState
 from offboard.mavlink.events import Heartbeat, ModeReport, VehicleIdentity
@@ -75,7 +75,7 @@ def act_without_decision(flight: FlightState, time_s: float) -> None:
     if phase is Phase.STAND_DOWN:
         outbox.request(flight, CommandLong.disarm())
         command = Command(0.0, LEVEL_DIRECTION, flight.command.heading_rad)
-    elif phase in (Phase.HOLD, Phase.LAND, Phase.HAND_BACK):
+    elif phase in ENDING:
         _end(flight)
         if flight.awaits_link or flight.in_phase_s >= LAND_STREAM_S or not flight.in_engage_mode:
             return

@@ -201,6 +201,7 @@ class Flight(FlightState):
         found, health, authority = self.session.vehicle, self.vehicle.health, self.authority
         if found is None:
             return None
+        missing = self.setpoints_missing or authority.standing is Standing.FAILSAFE
         return Supervised(
             found,
             ours=self.phase not in BEFORE_FLIGHT | ENDS and authority.is_ours,
@@ -210,7 +211,7 @@ class Flight(FlightState):
             landing=self.phase is Phase.LAND,
             setpoint_loss=authority.setpoint_loss,
             sticks=health is not None and health.radio_ok,
-            setpoints_missing=self.setpoints_missing or authority.standing is Standing.FAILSAFE,
+            supplied_s=-math.inf if missing else self.host_s,
         )
 
     def _status(self) -> tuple[int, int]:

@@ -14,7 +14,7 @@ from itertools import chain
 from numbers import Real
 from typing import Any
 
-from offboard.flight.phases import TRACKING, ExitCode, Phase
+from offboard.flight.phases import ENDING, TRACKING, ExitCode, Phase
 from offboard.flight.record import Refusal
 from offboard.flight.state import LEVEL_DIRECTION, FlightState
 from offboard.flight.timing import LOSSY
@@ -39,6 +39,7 @@ ANNOUNCED_KEPT = 200
 NEVER = -math.inf, -math.inf  # link time and host time
 ANSWERS_S = 10.0  # after this time without a reply to TIMESYNC requests, no reply is awaited
 REPEAT_S = 1.0  # after this time a request that was refused, or not answered, is sent again
+EFFECT_S = 3.0  # after this time an accepted request that ends the flight is sent again
 LOSES = f"more than {LOSSY:.0%} of TIMESYNC requests have no reply: each setpoint is sent twice"
 _LENGTH_TOLERANCE = 0.01
 
@@ -232,7 +233,9 @@ def request(flight: FlightState, request: CommandLong) -> bool:
     has_ticks = flight.vehicle.has_state and flight.silence_s < REPEAT_S
     is_answered = has_ticks and flight.clock.unanswered_s(flight.host_s) < ANSWERS_S
     waits = waits or (is_answered and flight.mode_after_s < host_s)
-    done = math.isfinite(requested_s) and result in GOOD_RESULTS
+    passed_s = flight.now_s - flight.vehicle.answered_s.get(request.command, -math.inf)
+    accepted = result in GOOD_RESULTS and not (flight.phase in ENDING and passed_s > EFFECT_S)
+    done = math.isfinite(requested_s) and accepted
     if waits or done or not flight.authority.permits_command(flight.now_s):
         return False
     flight.vehicle.results.pop(request.command, None)

@@ -73,6 +73,8 @@ BEFORE_FLIGHT = WAITING | {Phase.STREAM, Phase.ENGAGE, Phase.ARM}
 CONTROLLING = frozenset(each.code for each in Phase if each not in WAITING | ENDS)
 TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.PAUSE, Phase.HOVER})
 MOVING = frozenset({Phase.JOIN, Phase.TRACK})  # along the reference
+# phases that request the end of the flight. A person may reverse what other phases request
+ENDING = frozenset({Phase.HAND_BACK, Phase.HOLD, Phase.STAND_DOWN, Phase.LAND})
 # phases in which the failsafe judges
 FLYING = TRACKING | {Phase.TAKEOFF, Phase.HAND_BACK, Phase.HOLD}
 SERVICE_ONLY = frozenset({Phase.STANDBY, Phase.PAUSE, Phase.HAND_BACK})  # never in `fly`

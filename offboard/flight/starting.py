@@ -253,7 +253,7 @@ TOO_SOON = (
     "a flight ended; switch again"
 )
 BEFORE_TAKEOFF = "{flight.stop_reason} before takeoff"
-DISARMED_AGAIN = "the vehicle was disarmed just after it had armed"
+DISARMED_AGAIN = "the vehicle accepted arming, but its HEARTBEAT shows it disarmed"
 FLIGHT_DETECTED = "flight was detected while it was asked to disarm"
 LOST_AS_IT_ARMED = "{flight.authority.lost_reason} as it armed"
 

@@ -108,8 +108,8 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
 
 
 def _announce_change(flight: FlightState, parameter: Parameter) -> None:
-    """Announce a watched parameter that has changed, except the hover thrust that ArduCopter learns
-    in flight."""
+    """Announce each change of a watched parameter once (two programs may set it in turn), except of
+    the hover thrust that ArduCopter learns in flight."""
     name, now, dialect = parameter.name, parameter.value, flight.dialect
     before = flight.vehicle.parameters.get(name, now)
     if before == now or dialect is None or name == dialect.hover_parameter:
@@ -117,7 +117,7 @@ def _announce_change(flight: FlightState, parameter: Parameter) -> None:
     watched = next(each for each in dialect.watched_parameters if each.name == name)
     fault = watched.fault(now)
     why = f": {fault.found}. Fix: {fault.fix}" if fault else ""
-    outbox.announce(flight, f"{name} was changed from {before:g} to {now:g}{why}")
+    outbox.announce(flight, f"{name} was changed from {before:g} to {now:g}{why}", once=True)
 
 
 def is_of_another(flight: FlightState, event: Event) -> bool:

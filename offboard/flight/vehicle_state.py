@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.estimation.observer import LATEST_S
 from offboard.flight.phases import CONTROLLING
 from offboard.mavlink.events import (
     CRITICAL,
@@ -196,10 +197,11 @@ class VehicleState:
         return self.health is not None and self.health.prearm_ok
 
     def update(self, event: Event, now_s: float) -> bool:
-        """Store what one event reports. Returns False if it repeats an earlier event of its kind,
-        which makes it no measurement."""
+        """Store what one event reports. Returns False if it is no measurement: it repeats an event
+        of its kind, or is too old for the observer."""
         self.now_s = now_s
-        if self._repeats(event) and math.isfinite(self.armings_s[-1]):
+        late = isinstance(event, LocalPosition | Attitude) and event.time_s < self.time_s - LATEST_S
+        if late or (self._repeats(event) and math.isfinite(self.armings_s[-1])):
             return False
         self.heard_s[type(event)] = now_s
         if isinstance(event, (LocalPosition, Attitude)):
@@ -277,9 +279,7 @@ class VehicleState:
             self.resumed_s = time_s
 
     def _age_s(self, newest: LocalPosition | Attitude | None) -> float:
-        if newest is None:
-            return math.nan
-        return self.time_s - max(newest.time_s, self.resumed_s)
+        return self.time_s - max(newest.time_s, self.resumed_s) if newest else math.nan
 
     def _reset(self) -> None:
         """Forget the telemetry after a reboot, except whether the vehicle was armed, until the next

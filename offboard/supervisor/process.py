@@ -113,7 +113,7 @@ class TakeOver:
         self._session.senders.set_vehicle(known.vehicle, peer)
         assert self._session.dialect is not None
         self._dialect = self._session.dialect
-        self._recovery = Recovery(self._dialect, known, clock.monotonic_s(), beat["sent_s"])
+        self._recovery = Recovery(self._dialect, known, clock.monotonic_s())
         self._text_id = 0
 
     def run(self, reason: str) -> None:
@@ -182,10 +182,7 @@ class TakeOver:
 
 def _known(vehicle: Mapping[str, Any], setpoint_loss: Mapping[str, Any], **more: Any) -> Supervised:
     """Make a `Supervised` of the JSON of a beat."""
-    modes = tuple(setpoint_loss["modes"])
-    return Supervised(
-        VehicleFound(**vehicle), setpoint_loss=SetpointLoss(setpoint_loss["after_s"], modes), **more
-    )
+    return Supervised(VehicleFound(**vehicle), setpoint_loss=SetpointLoss(**setpoint_loss), **more)
 
 
 def _link(descriptors: list[int], stream: str, *, listens: bool) -> Link:

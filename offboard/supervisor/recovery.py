@@ -33,7 +33,7 @@ UNHEARD_MAX = 3  # most requests to a vehicle of which nothing is heard
 HOLD_S = 5.0  # from hold to land
 ACKNOWLEDGED_S = 3.0  # from the first report of hold to its acknowledgement, at most
 LONGEST_S = 300.0
-EARLY_S = 0.3  # the newest setpoint was sent before the newest beat, and may have been lost
+EARLY_S = 0.3  # the newest setpoint may have been lost
 SINK_MPS = 0.2  # a vehicle lands if it has had this downward speed within SINK_S
 SINK_S = 3.0  # longer than COM_DISARM_LAND, 2 s, after which it is disarmed
 # Without beats the supervisor acts EARLIER_S before the autopilot's own failsafe, so that only one
@@ -49,8 +49,8 @@ class Supervised:
     report that arrived at `reported_s` (`clock.monotonic_s`); the supervisor judges its age.
     `flying`: whether the vehicle is armed. `holding`: whether hold was requested, so that the mode
     hold is ours, too. `landing`: whether land was requested. `setpoint_loss`: what the autopilot
-    does without setpoints. `sticks`: whether it receives a pilot's sticks. `setpoints_missing`:
-    whether setpoints were missing already, or the failsafe for that flies the vehicle."""
+    does without setpoints. `sticks`: whether it receives a pilot's sticks. `supplied_s`: until
+    when setpoints were sent; -inf if they were missing already, or the failsafe for that acts."""
 
     vehicle: VehicleFound
     ours: bool
@@ -60,7 +60,7 @@ class Supervised:
     landing: bool = False
     setpoint_loss: SetpointLoss = NEVER
     sticks: bool = False
-    setpoints_missing: bool = False
+    supplied_s: float = -math.inf
 
     @property
     def silent_s(self) -> float:
@@ -69,18 +69,17 @@ class Supervised:
 
 
 class Recovery:
-    """One recovery, which begins at `began_s`. The controller sent its newest beat at `beat_s`, and
-    reported `known`. Times are those of `clock.monotonic_s`.
+    """One recovery, which begins at `began_s`. `known` is what the controller reported last. Times
+    are those of `clock.monotonic_s`.
 
     `end_reason` says how the recovery ended, empty until then; `news` are sentences for the user.
     """
 
-    def __init__(self, dialect: Dialect, known: Supervised, began_s: float, beat_s: float) -> None:
+    def __init__(self, dialect: Dialect, known: Supervised, began_s: float) -> None:
         self._dialect, self._known = dialect, known
         self._hold_s = 0.0 if known.landing else HOLD_S
         self._began_s = began_s
-        missing_s = beat_s + known.setpoint_loss.after_s - EARLY_S
-        self._loses_s = -math.inf if known.setpoints_missing else missing_s
+        self._loses_s = known.supplied_s + known.setpoint_loss.after_s - EARLY_S
         self._sticks = known.sticks
         self._mode: str | None = None
         self._before: str | None = None  # the mode before it

@@ -95,10 +95,8 @@ class Supervisor:
         sends from. Never waits."""
         if not self._lines:  # it has not loaded yet
             return
-        now_s = clock.monotonic_s()
         beat = {
             "known": asdict(vehicle),
-            "sent_s": now_s,
             "peer": peer,
             "stream": link.is_stream,
             "listens": link.listens,
@@ -106,7 +104,7 @@ class Supervisor:
             "signing": self._signing.state() if self._signing else None,
         }
         line = json.dumps(beat).encode() + b"\n"
-        self._unanswered_s = min(self._unanswered_s, now_s)
+        self._unanswered_s = min(self._unanswered_s, clock.monotonic_s())
         descriptors = [*link.descriptors(), log_descriptor]
         passed = (link.opened, descriptors)
         try:

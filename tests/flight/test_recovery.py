@@ -29,7 +29,7 @@ from simulator.steps import STEP_S
 HOLD, LAND = 176, 21  # MAV_CMD_DO_SET_MODE, MAV_CMD_NAV_LAND
 FIRMWARES = pytest.mark.parametrize("dialect", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
 VEHICLE = VehicleFound(1, 1, "px4")
-OURS = Supervised(VEHICLE, ours=True, flying=True, reported_s=math.inf)
+OURS = Supervised(VEHICLE, ours=True, flying=True, reported_s=math.inf, supplied_s=0.0)
 DISARMED, TOO_LONG = "the vehicle is disarmed", f"not landed after {LONGEST_S:.0f} s"
 Timed = tuple[float, Event]
 ACCEPTED = (0.05, CommandAck(HOLD, "ACCEPTED"))
@@ -40,7 +40,7 @@ def asked(
 ) -> tuple[list[tuple[float, int]], str]:
     """Run a recovery that begins at 0 s, with a vehicle that showed the mode `shown` 0.4 s before
     and reports `events`. Return the times and numbers of the commands, and why it ended."""
-    recovery, waiting = Recovery(dialect, known, 0.0, 0.0), sorted(events, key=lambda each: each[0])
+    recovery, waiting = Recovery(dialect, known, 0.0), sorted(events, key=lambda each: each[0])
     if shown:
         recovery.see(Heartbeat(shown, True, 4, 2), -0.4)
     commands: list[tuple[float, int]] = []
@@ -205,7 +205,7 @@ def test_mode_change_while_disarming_is_not_a_pilots_choice() -> None:
 
 
 def test_refused_command_is_reported() -> None:
-    recovery = Recovery(PX4, OURS, 0.0, 0.0)
+    recovery = Recovery(PX4, OURS, 0.0)
     for result, said in (("ACCEPTED", []), ("DENIED", ["the vehicle answers DENIED"])):
         recovery.see(CommandAck(HOLD, result), 0.1)
         assert recovery.news == said
@@ -246,14 +246,14 @@ def recovered(
     instance.feed(session.encode(CommandLong.message_interval(436, 50.0)))  # CURRENT_MODE
     level = session.encode(AttitudeTarget(0.0, Command(9.81, (0.0, 0.0, 1.0), 0.0), 0.489, 9.81))
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": fallback})
-    known = Supervised(VEHICLE, ours=True, flying=True, reported_s=0.0, setpoint_loss=loss)
+    known = replace(OURS, reported_s=0.0, setpoint_loss=loss)
     recovery: Recovery | None = None
     for step in range(round(90.0 / STEP_S)):
         now_s = step * STEP_S - STREAM_S
         if now_s < 1e-9 and step % 25 == 0:
             instance.feed(level)
         if recovery is None and now_s >= silent_s:
-            recovery = Recovery(PX4, known, now_s, 0.0)
+            recovery = Recovery(PX4, known, now_s)
         if now_s >= pilot[0]:
             commander.switch(pilot[1])
             pilot = (math.inf, "")

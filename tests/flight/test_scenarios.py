@@ -13,7 +13,7 @@ from typing import Any
 
 import faults
 import pytest
-from pair import Filter, Pair
+from pair import LEAN_COPTER, Filter, Pair, frame_id, frames_of
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from watch import (
     HIGH,
@@ -100,9 +100,9 @@ def says_once_that_nothing_is_heard(pair: Pair) -> None:
     assert list(announced(pair))[:-1] == ["waiting: nothing is heard on this link"]
 
 
-def says_the_change(pair: Pair) -> None:
+def says_each_change_once(pair: Pair) -> None:
     said = [each for each in announced(pair) if "COM_OF_LOSS_T" in each]
-    assert said == ["COM_OF_LOSS_T was changed from 1 to 2"]
+    assert said == [f"COM_OF_LOSS_T was changed from {a}" for a in ("1 to 2", "2 to 1")]
 
 
 def names_the_key_soon(pair: Pair) -> None:
@@ -247,6 +247,11 @@ def asks_each_second(pair: Pair) -> None:
     assert len(pair.landings) == 4
 
 
+def asks_every_three_seconds(pair: Pair) -> None:
+    """An accepted request to land that has no effect is repeated."""
+    assert len(pair.landings) == 5
+
+
 def asks_once(pair: Pair) -> None:
     assert not said(pair, "waiting for the link")
 
@@ -341,6 +346,14 @@ def begins_to_arrive(kind: int, at_s: float) -> Filter:
     return lambda time_s, datagrams: datagrams if time_s >= at_s else rest(time_s, datagrams)
 
 
+def late_positions() -> Filter:
+    """Return a filter that delays positions by 0.2 s, more than the observer permits."""
+    late = faults.delivering(lambda _, frame: [0.2 * (frame_id(frame) == faults.POSITION)])
+    return lambda time_s, datagrams: late(
+        time_s, [frame for datagram in datagrams for frame in frames_of(datagram)]
+    )
+
+
 def lose_two_heartbeats(pair: Pair) -> None:
     """Lose two HEARTBEATs after the next one, and from now on every CURRENT_MODE."""
     pair.down = faults.without(faults.CURRENT_MODE)
@@ -365,8 +378,8 @@ def signed_by_another() -> Pair:
 
 def set_parameter(pair: Pair) -> None:
     codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
-    message = mavlink.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", 2.0, 9)
-    for _ in range(2):
+    for value in (2.0, 2.0, 1.0, 2.0, 1.0):
+        message = mavlink.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", value, 9)
         pair.instance.feed(message.pack(codec))
 
 
@@ -433,6 +446,14 @@ ROWS = {
         r"not ready: it does not report whether it flies \(EXTENDED_SYS_STATE\)", nothing_sent,
         down=faults.without(faults.EXTENDED_SYS_STATE), limits=HEALTH_IN_5_S,
     ),
+    "positions arrive 0.2 s later than attitudes": refusal(
+        "not ready: no LOCAL_POSITION_NED arrives", nothing_sent, down=late_positions(),
+        limits=HEALTH_IN_5_S,
+    ),
+    "positions begin to arrive 0.2 s later than attitudes": aborts(
+        Phase.FAILED, "no new LOCAL_POSITION_NED for 0.[56] s", fly=px4.hover, failsafes=["blind"],
+        at=tracking(faults.downlink(late_positions())),
+    ),
     "the vehicle receives nothing": refusal(
         "not ready: no TIMESYNC request was answered for 5 s: does the vehicle receive them?",
         nothing_sent, at=then(Phase.HEALTH, 0.2, deafen), limits=HEALTH_IN_5_S,
@@ -494,6 +515,11 @@ ROWS = {
         "the vehicle's own failsafe flew it, in POSCTL; the vehicle said: ",
         landed_by_its_failsafe, ended_by="link", firmware=faults.refusing("land", "No."),
     ),
+    "landing accepted without effect": aborts(
+        Phase.FAILED, "not landed and disarmed after 15 s", asks_every_three_seconds, armed=True,
+        fly=copter.hover, limits={"land_s": 15.0},
+        firmware=replace(LEAN_COPTER, rules=(Rule("land"), *LEAN_COPTER.rules)),
+    ),
     "on the ground by its land detector, the vehicle does not disarm": flies(
         asked_to_disarm_without_force, fly=hover_without_disarming
     ),
@@ -506,8 +532,8 @@ ROWS = {
     "PX4 leaves the landing mode as it disarms": flies(
         fly=partial(px4.hover, "reference.duration_s=3.3")
     ),
-    "a ground station sets a parameter in flight, twice": flies(
-        says_the_change, fly=px4.hover, at=tracking(set_parameter),
+    "ground stations set a parameter in flight, in turn": flies(
+        says_each_change_once, fly=px4.hover, at=tracking(set_parameter),
     ),
     "takeoff by command": flies(took_off_by_command, fly=copter.hop),
     "takeoff refused": ends(

@@ -243,12 +243,15 @@ def test_stopped_supervisor_does_not_guard_until_it_continues(rig: Rig) -> None:
 
 
 def test_stopped_supervisor_recognises_the_vehicles_failsafe(rig: Rig) -> None:
-    """Beats contain the time at which they were sent. Regression: counted from the time of reading,
-    the failsafe seemed too early and so to be a pilot's choice."""
-    rig.beat(replace(OURS, setpoint_loss=SetpointLoss(1.0, ("AUTO.LOITER",))))
+    """Beats contain the time until which setpoints were sent. Regression: counted from the time of
+    reading, or of sending by a controller that was stopped within the turn, the failsafe seemed too
+    early and so to be a pilot's choice."""
+    known = replace(OURS, setpoint_loss=SetpointLoss(1.0, ("AUTO.LOITER",)))
+    begun = replace(known, supplied_s=clock.monotonic_s())
     os.kill(rig.supervisor.process.pid, signal.SIGSTOP)
-    rig.abandon()
     time.sleep(1.2)
+    rig.beat(begun)
+    rig.abandon()
     rig.report(LOITER, status=5)
     os.kill(rig.supervisor.process.pid, signal.SIGCONT)
     told = ""

@@ -213,7 +213,7 @@ def test_json_lines_announce_live_page_and_end_with_result(called: Called, tmp_p
 @pytest.mark.parametrize(
     ("scenario", "sentence"),
     [
-        ("pilot_disarms", "the vehicle was disarmed just after it had armed"),
+        ("pilot_disarms", "the vehicle accepted arming, but its HEARTBEAT shows it disarmed"),
         ("clock_jump_35s", "the clock of the vehicle jumped by 35.0 s"),
         ("link_saturates", "telemetry is 1.06 s old"),
     ],
