@@ -256,8 +256,18 @@ class Senders:
     def candidates(self, now_s: float) -> str:
         """The system ids that could be the vehicle, as text, if there are several and `wanted` is
         None; else empty."""
-        present = [each for each, at_s in self.systems.items() if now_s - at_s <= HEARD_S]
+        present = self._present(now_s)
         return _listed(present) if self._wanted is None and len(present) > 1 else ""
+
+    def _present(self, now_s: float) -> list[int]:
+        return [each for each, at_s in self.systems.items() if now_s - at_s <= HEARD_S]
+
+    def others(self, now_s: float) -> str:
+        """Which other autopilots are heard than the vehicle, as the end of a sentence that it is
+        not heard; empty if none is."""
+        others = [each for each in self._present(now_s) if each != self.own.system_id]
+        known = f" from system {self.own.system_id}, but from {_listed(others)}; see --system"
+        return known if others else ""
 
     def twin(self, now_s: float) -> str:
         """A sentence if another autopilot with the vehicle's system id sends from another address;
