@@ -416,7 +416,7 @@ ROWS = {
     # the vehicle refuses or is not there
     "no vehicle": refusal(
         "no vehicle heard in 14 s", says_once_that_nothing_is_heard,
-        dead=True, limits={"connect_s": 14.0}, ended_by="link",
+        dead=True, limits={"connect_s": 14.0},
     ),
     "PX4 by external vision, whose pre-arm checks pass only in OFFBOARD": flies(
         whole, down=flown_by_external_vision()
