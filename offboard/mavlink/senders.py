@@ -107,11 +107,8 @@ class Senders:
         silent = now_s - self.newest_frame_s > PEER_SILENT_S
         if not (silent and (self.roams or same_host(peer, self.peer))):
             return False
-        vehicle = self.vehicle
-        assert vehicle is not None
-        ids = vehicle.system_id, vehicle.component_id
-        genuine = self._genuine(datagram)
-        moves = any((frame.system_id, frame.component_id) == ids for frame in genuine)
+        ids, frames = (self.own.system_id, AUTOPILOT_COMPONENT), self._genuine(datagram)
+        moves = any((frame.system_id, frame.component_id) == ids for frame in frames)
         if moves:  # so the autopilot at the other address was the vehicle itself
             self.peer, self.twin_s = peer, -math.inf
         return moves
@@ -342,11 +339,9 @@ def unfit_type(vehicle_type: int, *, helicopter: bool) -> str:
     name = "VTOL" if name.startswith("VTOL") else name  # pymavlink has old names: VTOL_RESERVED2
     if helicopter:
         return f"the vehicle is a {name}; its vehicle file says airframe: helicopter"
+    flies = f"the vehicle is a {name}; offboard flies multirotors"
     hint = " (airframe: helicopter in its vehicle file flies it)"
-    return (
-        f"the vehicle is a {name}; offboard flies multirotors"
-        f"{hint if vehicle_type == HELICOPTER else ''}"
-    )
+    return flies + hint if vehicle_type == HELICOPTER else flies
 
 
 def _receiver(frame: Frame) -> Address:
