@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -128,12 +127,11 @@ def irregular(phases: tuple[Event, ...]) -> list[Event]:
     """Return the phases with which a flight was ended early, and those that followed from it."""
     if _given_back([event.phase for event in phases]):
         return []
+    early = {"hold", "land", "stand down", "failed", "yielded"}
     return [
         event
-        for before, event in pairwise(phases)
-        if event.phase in {"hold", "land", "stand down", *_LANDING_ENDS}
-        and (before.phase, event.phase) != ("land", "disarmed")
-        and (event.phase, event.reason) != ("land", RESTS)
+        for event in phases
+        if event.phase in early and (event.phase, event.reason) != ("land", RESTS)
     ]
 
 

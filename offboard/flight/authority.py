@@ -189,13 +189,11 @@ class Authority:
         """Whether the newest report that counts is recent enough to act on."""
         return now_s - self.counted_report_s <= MODE_KNOWN_S
 
-    def heard(self, now_s: float) -> bool:
-        """Whether reports of the mode arrive, even if none counts yet."""
-        return now_s - self.report_s <= MODE_KNOWN_S
-
     def unheard_s(self, now_s: float) -> float:
-        """Time since the newest report of the mode if it is longer than MODE_KNOWN_S; else 0."""
-        return 0.0 if self.heard(now_s) else now_s - self.report_s
+        """Time since the newest report of the mode, even if it does not count, if that is longer
+        than MODE_KNOWN_S; else 0."""
+        since_s = now_s - self.report_s
+        return since_s if since_s > MODE_KNOWN_S else 0.0
 
     def permits_setpoint(self, now_s: float) -> bool:
         """Whether a setpoint may be sent: to a vehicle that follows it, or for the stream that PX4

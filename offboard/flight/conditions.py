@@ -74,9 +74,8 @@ def blind(flight: FlightState) -> str:
 
 
 def mode_unknown(flight: FlightState) -> str:
-    if flight.authority.heard(flight.now_s):
-        return ""
-    return f"no report of the mode for {flight.now_s - flight.authority.report_s:.1f} s"
+    unheard_s = flight.authority.unheard_s(flight.now_s)
+    return f"no report of the mode for {unheard_s:.1f} s" if unheard_s else ""
 
 
 # ---------------------------------------------------------------------- who has the vehicle

@@ -25,16 +25,18 @@ MESSAGES_DROPPED = (
 FIRST_S = {Phase.CONNECT: 2.5, Phase.HEALTH: 5.0, Phase.STANDBY: 1.0}
 HELD_S = 0.5  # a reason that holds for less is not announced: a new message is slow at first
 AGAIN_S = 10.0  # interval at which the same reason is announced again, with new figures
+FIGURES = re.compile("[0-9]+")
 
 
 class News:
     """Announcements of one flight beside its phases: pauses of this process and dropped messages
     (`add` reports one), each at most once a second, and why the flight does not begin yet. In
-    HEALTH the reason is repeated every AGAIN_S; in CONNECT and STANDBY it is announced once."""
+    HEALTH the reason is repeated every AGAIN_S if its figures have changed; in CONNECT and STANDBY
+    it is announced once."""
 
     def __init__(self) -> None:
         self.paused, self.dropped = Repeated(PAUSED), Repeated(MESSAGES_DROPPED)
-        self._kind = self._said = ""  # present reason and newest announced, without figures
+        self._kind = self._said = ""  # present reason, without figures, and newest announced
         self._since_s = self._said_s = -math.inf
 
     def due(self, state: FlightState, now_s: float) -> list[str]:
@@ -49,15 +51,15 @@ class News:
         now_s = state.now_s
         why = {Phase.CONNECT: _unheard, Phase.HEALTH: unfit, Phase.STANDBY: _left_alone}
         reason = why[state.phase](state)
-        kind = re.sub(r"[0-9]+", "", reason)
+        kind = FIGURES.sub("", reason)
         if kind != self._kind:
             self._kind, self._since_s = kind, now_s
         if state.in_phase_s < FIRST_S[state.phase] or now_s - self._since_s < HELD_S:
             return ""
         again = state.phase is Phase.HEALTH and now_s - self._said_s >= AGAIN_S
-        if not reason or (kind == self._said and not again):
+        if reason in ("", self._said) or (kind == FIGURES.sub("", self._said) and not again):
             return ""
-        self._said, self._said_s = kind, now_s
+        self._said, self._said_s = reason, now_s
         return f"waiting: {reason}"
 
 

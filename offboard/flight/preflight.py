@@ -17,12 +17,12 @@ from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, VehicleState
 from offboard.mavlink import senders
 from offboard.mavlink.dialects.base import Dialect
-from offboard.mavlink.events import GpsFix, Heartbeat, NoFix
+from offboard.mavlink.events import Attitude, GpsFix, Heartbeat, LocalPosition, NoFix
 from offboard.mavlink.outgoing import ParamRead
 from offboard.mavlink.session import Session
 from offboard.model.vehicle import Vehicle
 
-TELEMETRY = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
+TELEMETRY = {"LOCAL_POSITION_NED": LocalPosition, "ATTITUDE_QUATERNION": Attitude}
 MINIMUM_TELEMETRY_HZ = 10.0
 REPEAT_S = 0.5  # between two requests for a parameter
 REPLY_TIMEOUT_S = 2.0  # for parameters
@@ -265,15 +265,13 @@ def signs(ground: Ground) -> str:
 
 
 def _no_telemetry(ground: Ground) -> str:
-    vehicle = ground.vehicle
-    newest = {"LOCAL_POSITION_NED": vehicle.position, "ATTITUDE_QUATERNION": vehicle.attitude}
-    missing = [name for name, value in newest.items() if value is None]
-    if vehicle.heartbeat is not None and vehicle.age_s(Heartbeat) > ARMED_KNOWN_S:
-        missing.append("HEARTBEAT")
+    vehicle, session = ground.vehicle, ground.session
+    if vehicle.age_s(Heartbeat) > ARMED_KNOWN_S:  # then earlier reports explain nothing
+        return f"no HEARTBEAT arrives{session.senders.others(session.link_time_s)}"
+    missing = [name for name, kind in TELEMETRY.items() if vehicle.age_s(kind) > ARMED_KNOWN_S]
     if not missing:
         return ""
-    silent = "HEARTBEAT" in missing  # then earlier reports explain nothing
-    problem = vehicle.estimator.problem if vehicle.estimator and not silent else ""
+    problem = vehicle.estimator.problem if vehicle.estimator else ""
     why = (problem and f": {problem}") + vehicle.explanation(ground.known_dialect.unsaid)
     return f"no {' and no '.join(missing)} arrives{why}"
 

@@ -107,11 +107,8 @@ class Senders:
         silent = now_s - self.newest_frame_s > PEER_SILENT_S
         if not (silent and (self.roams or same_host(peer, self.peer))):
             return False
-        vehicle = self.vehicle
-        assert vehicle is not None
-        ids = vehicle.system_id, vehicle.component_id
-        genuine = self._genuine(datagram)
-        moves = any((frame.system_id, frame.component_id) == ids for frame in genuine)
+        ids, frames = (self.own.system_id, AUTOPILOT_COMPONENT), self._genuine(datagram)
+        moves = any((frame.system_id, frame.component_id) == ids for frame in frames)
         if moves:  # so the autopilot at the other address was the vehicle itself
             self.peer, self.twin_s = peer, -math.inf
         return moves
@@ -256,8 +253,18 @@ class Senders:
     def candidates(self, now_s: float) -> str:
         """The system ids that could be the vehicle, as text, if there are several and `wanted` is
         None; else empty."""
-        present = [each for each, at_s in self.systems.items() if now_s - at_s <= HEARD_S]
+        present = self._present(now_s)
         return _listed(present) if self._wanted is None and len(present) > 1 else ""
+
+    def _present(self, now_s: float) -> list[int]:
+        return [each for each, at_s in self.systems.items() if now_s - at_s <= HEARD_S]
+
+    def others(self, now_s: float) -> str:
+        """Which other autopilots are heard than the vehicle, as the end of a sentence that it is
+        not heard; empty if none is."""
+        others = [each for each in self._present(now_s) if each != self.own.system_id]
+        known = f" from system {self.own.system_id}, but from {_listed(others)}; see --system"
+        return known if others else ""
 
     def twin(self, now_s: float) -> str:
         """A sentence if another autopilot with the vehicle's system id sends from another address;
@@ -332,11 +339,9 @@ def unfit_type(vehicle_type: int, *, helicopter: bool) -> str:
     name = "VTOL" if name.startswith("VTOL") else name  # pymavlink has old names: VTOL_RESERVED2
     if helicopter:
         return f"the vehicle is a {name}; its vehicle file says airframe: helicopter"
+    flies = f"the vehicle is a {name}; offboard flies multirotors"
     hint = " (airframe: helicopter in its vehicle file flies it)"
-    return (
-        f"the vehicle is a {name}; offboard flies multirotors"
-        f"{hint if vehicle_type == HELICOPTER else ''}"
-    )
+    return flies + hint if vehicle_type == HELICOPTER else flies
 
 
 def _receiver(frame: Frame) -> Address:

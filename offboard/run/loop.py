@@ -254,7 +254,7 @@ class Loop:
             outcome = self._interrupted(outcome)
         code, sentence = outcome.exit_code, outcome.sentence
         if self._error:
-            code = ExitCode.ABORTED
+            code = code or ExitCode.ABORTED
             sentence = sentence if self._error in sentence else f"{self._error}; {sentence}"
         if self._log.problem:
             lands = self._flown.current.limits.log_lost == "land"

@@ -382,7 +382,7 @@ def test_exception_requests_a_landing_and_ends_with_code_4(
     error: BaseException, phase: Phase, tmp_path: Path
 ) -> None:
     """Except if the service is in standby again: the flight that the exception ended has an exit
-    code of its own."""
+    code of its own; and before takeoff, where the flight is refused."""
 
     def fails(left: int) -> None:
         if left in (3, 4):
@@ -397,6 +397,9 @@ def test_exception_requests_a_landing_and_ends_with_code_4(
         assert outcome.exit_code == 4
         assert outcome.sentence.startswith(f"internal error: {type(error).__name__}: {error} (")
         assert outcome.sentence.endswith("; flown and landed")
+        refused = Brief(5, fails, phase=phase)
+        refused.ends_with = Outcome(3, "before takeoff")
+        assert fly(refused, tmp_path / "refused").exit_code == 3
 
 
 @pytest.mark.parametrize(("simulator", "turns"), [(None, 8), (Silent(), 1)])  # 0.3 s

@@ -473,6 +473,21 @@ def test_service_flies_again_after_a_vehicle_reboot(served: Served) -> None:
     pair.until(lambda: pair.phase is Phase.HOVER, 40.0)
 
 
+def test_reason_of_a_wait_is_named_once(served: Served) -> None:
+    """First the vehicle has a new system id, after a reboot; then it has the old one again, and its
+    estimator does not run yet."""
+    pair = served()
+    pair.until(lambda: pair.phase is Phase.STANDBY, 20.0)
+    pair.down = lambda time_s, datagrams: [another_vehicle(9)]
+    pair.run(40.0)
+    pair.down = faults.without(faults.ATTITUDE, faults.POSITION)
+    pair.run(40.0)
+    assert [each for each in pair.state.announced if each.startswith("waiting: no ")] == [
+        "waiting: no HEARTBEAT arrives from system 1, but from 9; see --system",
+        "waiting: no LOCAL_POSITION_NED and no ATTITUDE_QUATERNION arrives",
+    ]
+
+
 @BOTH
 def test_vehicle_is_landed_after_a_link_outage(served: Served, on: str) -> None:
     """ArduCopter, not heard for 4 s, has stayed in GUIDED without setpoints. PX4 would return from

@@ -32,6 +32,7 @@ from processes import (
 )
 
 from offboard.analysis import history, tlog
+from offboard.analysis.score import score
 from offboard.flight.phases import Outcome
 from offboard.link import after_flight
 from offboard.link.stop import StopRequests
@@ -125,7 +126,9 @@ def test_missing_vehicle_ends_fly_with_code_3(called: Called, tmp_path: Path) ->
     assert said.startswith("no vehicle heard in 0 s; is it running, and sending to this port?")
     log = tlog.read(tmp_path / "x" / "flight.tlog")
     assert history.configuration(log) == (tmp_path / "x" / "flight.yaml").read_text()
-    assert flown(tmp_path).phases[-1].phase == "failed"
+    logged = flown(tmp_path)
+    assert logged.phases[-1].phase == "failed"
+    assert score(logged).ended_by == "link"
 
 
 @pytest.mark.usefixtures("in_memory")

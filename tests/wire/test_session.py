@@ -85,9 +85,11 @@ def test_no_other_sender_replaces_the_vehicle(
     vehicle = Sender(1)
     session = pinned(vehicle)
     session.receive(vehicle.position(1000), PEER, 10.0)
-    for data in (sender.position(1020), b"\xfd nonsense"):
+    for data in (sender.heartbeat(), sender.position(1020), b"\xfd nonsense"):
         reception = session.receive(data, place, 10.0 + silence_s)
         assert (reception.events, reception.frames) == ([], [])
+    other = sender.ids == (2, 1)
+    assert ("from 2; see" in session.senders.others(session.link_time_s)) == other
     assert len(session.receive(vehicle.position(1040), PEER, 99.0).events) == 1
 
 
