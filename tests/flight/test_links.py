@@ -373,8 +373,7 @@ def test_full_stream_does_not_block_and_sends_the_newest_setpoint(
     numbers = [int.from_bytes(f.payload[:4], "little") for f in frames if f.message_id == 82]
     assert all(frame.verified for frame in frames)
     assert numbers == sorted(numbers)
-    assert len(numbers) < count  # queued ones were replaced
-    assert numbers[-2] < count - 1  # by the last one
+    assert len(numbers) < count  # queued ones were replaced, but not one that was sent in part
     assert frames[-2].raw == heartbeat
 
 

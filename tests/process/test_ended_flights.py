@@ -218,7 +218,7 @@ def test_json_lines_announce_live_page_and_end_with_result(called: Called, tmp_p
     [
         ("pilot_disarms", "the vehicle accepted arming, but its HEARTBEAT shows it disarmed"),
         ("clock_jump_35s", "the clock of the vehicle jumped by 35.0 s"),
-        ("link_saturates", "telemetry is 1.06 s old"),
+        ("link_saturates", "telemetry is 1.10 s old"),
     ],
 )
 def test_lockstep_flights_report_the_true_cause(
