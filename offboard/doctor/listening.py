@@ -183,6 +183,8 @@ class Observation(Ground):
     def take(self, chunk: Chunk) -> None:
         """Process received bytes."""
         self.senders.receive(chunk.data, chunk.peer)
+        if self.session.peer not in (None, chunk.peer):  # it may be from another vehicle
+            self.session.senders.overhear(chunk.data, self.session.link_time_s)
         reception = self.session.receive(chunk.data, chunk.peer, chunk.arrived_s)
         for event in reception.events:
             if not self._found_s and self.session.vehicle is not None:

@@ -81,6 +81,8 @@ class Flight(FlightState):
             outbox.send(self, *due, *replies)
         finally:
             self._inputs.end()
+        peer = self.session.peer
+        self.overhear([chunk.data for chunk in chunks if peer not in (None, chunk.peer)])
         frames = outbox.flush(self)
         self._logged += frames
         return frames

@@ -115,7 +115,6 @@ class Session:
         found = Reception()
         if self.vehicle is not None and peer != self.peer:
             if not self.senders.moves_to(peer, now_s, datagram):
-                self.senders.overhear(datagram, self.link_time_s)
                 return found
             self._heartbeat_sent = None  # send one at once: a router learns our address from it
             found.events.append(PeerChanged(peer))

@@ -12,7 +12,7 @@ import pytest
 from corpus import expected, replayed, unpacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pair import SHORT, UNIX_EPOCH_US, HostClock, Pair, hover, in_phase
+from pair import SHORT, UNIX_EPOCH_US, HostClock, Pair, another_vehicle, hover, in_phase
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner, Result
 
@@ -236,16 +236,21 @@ def check(pair: Pair, tmp_path: Path, least: int) -> None:
 
 
 def test_replay_reproduces_a_flight_with_duplicate_ids_and_a_pause(tmp_path: Path) -> None:
-    """Frames of another program, which the log does not hold as received, end the flight."""
+    """Frames of another program, which the log does not hold as received, end the flight. Before
+    that, a datagram from another address, which it does not hold either, delays it by 10 s."""
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
     forged = mavlink.MAVLink_heartbeat_message(18, 8, 0, 8, 4, 3).pack(codec)
 
     def down(time_s: float, datagrams: list[bytes]) -> list[bytes]:
-        if 9.0 < time_s < 9.01 and datagrams:
+        if 19.0 < time_s < 19.01 and datagrams:
             return [datagrams[0] + forged + datagrams[0][:7], *datagrams[1:]]
         return datagrams
 
-    pair = short_flight(down=down, at=[(in_phase(Phase.CLIMB, 0.5), lambda p: p.pause(0.4))])
+    def strange(pair: Pair) -> None:
+        pair.waiting.append(Chunk(another_vehicle(1), "elsewhere", pair.host_s))
+
+    paused = in_phase(Phase.CLIMB, 0.5), lambda p: p.pause(0.4)
+    pair = short_flight(down=down, at=[(in_phase(Phase.HEALTH, 0.5), strange), paused])
     assert pair.went_through(Phase.HOLD)
     assert any("paused" in line for line in pair.companion.announced)
     check(pair, tmp_path, least=40)

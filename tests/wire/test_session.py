@@ -86,6 +86,7 @@ def test_no_other_sender_replaces_the_vehicle(
     session = pinned(vehicle)
     session.receive(vehicle.position(1000), PEER, 10.0)
     for data in (sender.heartbeat(), sender.position(1020), b"\xfd nonsense"):
+        session.senders.overhear(data, session.link_time_s)
         reception = session.receive(data, place, 10.0 + silence_s)
         assert (reception.events, reception.frames) == ([], [])
     other = sender.ids == (2, 1)
