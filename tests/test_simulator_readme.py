@@ -17,7 +17,7 @@ import pytest
 from simulator import config
 from simulator.autopilot.commander import ACTIONS, CONDITIONS, TEXT_VALUES
 from simulator.autopilot.firmware import AFTER_DELAY, ByParameter, Firmware, Rule
-from simulator.autopilot.values import Result
+from simulator.autopilot.values import Behaviour, Result
 from simulator.faults import Fault
 from simulator.faults.fault import Timed
 from simulator.firmware import FIRMWARES
@@ -124,6 +124,14 @@ def test_rules_name_only_existing_events_modes_and_parameters(firmware: Firmware
     assert list(unknown(firmware, wrong)) == ["LND", "DRFT", "COM_X"]
     known = firmware.system_parameter
     assert [exists(firmware, f"{known}={values}") for values in ("1,2", "1,,2")] == [True, False]
+
+
+def test_example_of_a_behaviour_is_a_new_member() -> None:
+    """A text that another member has would make it an alias of that member."""
+    recipe = README.read_text().partition("To add a behaviour")[2]
+    example = re.search(r'`(\w+) = "(.+?)"`', recipe)
+    assert example
+    assert not {each.value for each in Behaviour} & {example[2]}
 
 
 def test_both_firmwares_have_the_same_parameter_roles() -> None:

@@ -98,7 +98,7 @@ class Behaviour(Enum):
     LEVEL = "level attitude, least throttle: a manual mode with sticks down"
     COAST = "keeps the last demand: a manual mode without stick input"
     SETPOINT = "obeys setpoints"
-    ORBIT = "flies a circle"
+    ORBIT = "flies the circle that a client requests"
 
 
 @dataclass(frozen=True, slots=True)
