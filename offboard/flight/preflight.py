@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 
+from offboard.estimation.observer import LATEST_S
 from offboard.flight.phases import Limits, ServiceOptions
 from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, VehicleState
@@ -271,9 +272,11 @@ def _no_telemetry(ground: Ground) -> str:
     missing = [name for name, kind in TELEMETRY.items() if vehicle.age_s(kind) > ARMED_KNOWN_S]
     if not missing:
         return ""
+    unused = any(session.telemetry.rates_hz.get(name) for name in missing)
+    how = f" except repeated or over {LATEST_S:g} s late" if unused else ""
     problem = vehicle.estimator.problem if vehicle.estimator else ""
     why = (problem and f": {problem}") + vehicle.explanation(ground.known_dialect.unsaid)
-    return f"no {' and no '.join(missing)} arrives{why}"
+    return f"no {' and no '.join(missing)} arrives{how}{why}"
 
 
 def _unguarded(ground: Ground) -> str:

@@ -447,8 +447,8 @@ ROWS = {
         down=faults.without(faults.EXTENDED_SYS_STATE), limits=HEALTH_IN_5_S,
     ),
     "positions arrive 0.2 s later than attitudes": refusal(
-        "not ready: no LOCAL_POSITION_NED arrives", nothing_sent, down=late_positions(),
-        limits=HEALTH_IN_5_S,
+        "not ready: no LOCAL_POSITION_NED arrives except repeated or over 0.1 s late", nothing_sent,
+        down=late_positions(), limits=HEALTH_IN_5_S,
     ),
     "positions begin to arrive 0.2 s later than attitudes": aborts(
         Phase.FAILED, "no new LOCAL_POSITION_NED for 0.[56] s", fly=px4.hover, failsafes=["blind"],
