@@ -126,10 +126,10 @@ class History:
 
     def events(self) -> list[Event]:
         """Return phases, announcements, modes and messages of the vehicle in the order of time;
-        events before the first telemetry come first."""
+        those before the first telemetry first, in the order of the log."""
         modes = (replace(event, what=f"mode {event.what}") for event in self.modes)
         every = (*self.phases, *self.announcements, *modes, *self.vehicle_messages)
-        return sorted(every, key=lambda e: -math.inf if math.isnan(e.time_s) else e.time_s)
+        return sorted(every, key=lambda e: (np.nan_to_num(e.time_s, nan=-math.inf), e.unix_s))
 
 
 def gather(log: Tlog, *, unix_times: bool = False) -> History:

@@ -97,7 +97,9 @@ def nothing_sent(pair: Pair) -> None:
 
 def says_once_that_nothing_is_heard(pair: Pair) -> None:
     nothing_sent(pair)
-    assert list(announced(pair))[:-1] == ["waiting: nothing is heard on this link"]
+    waits = "waiting: nothing is heard on this link"
+    assert list(announced(pair))[:-1] == [waits]
+    assert pair.history().events()[0].what == waits
 
 
 def says_each_change_once(pair: Pair) -> None:
