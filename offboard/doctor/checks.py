@@ -314,7 +314,7 @@ def parameters(seen: Observation) -> Iterable[Finding]:
     """Parameters of the autopilot, with the line that sets each."""
     known, health = seen.vehicle.parameters, seen.vehicle.health
     radio, good = health is not None and health.radio_ok, []
-    unanswered = [parameter.name for parameter in seen.known_dialect.unanswered(known)]
+    unanswered = [parameter.name for parameter in seen.known_dialect.without_reply(known)]
     for parameter in seen.known_dialect.watched_parameters:
         name, value = parameter.name, known.get(parameter.name)
         if value is None:

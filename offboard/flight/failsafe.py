@@ -58,7 +58,7 @@ def late_link(flight: FlightState) -> str:
     return f"the delay of the link has grown by {growth_s:.2f} s" if exceeds else ""
 
 
-def unanswered(flight: FlightState) -> str:
+def replies_overdue(flight: FlightState) -> str:
     """Number of TIMESYNC requests in a row whose reply is overdue, times their period."""
     requests = flight.clock.overdue(flight.host_s)
     if requests * flight.period_s <= flight.limits.silence_s:
@@ -295,7 +295,7 @@ ROWS = (
     Row("late", telemetry_old, "limits.setpoint_age_s", HOLD, 0.5, "link"),
     Row("rate", rare, f"{LEAST_TELEMETRY_HZ:g} Hz", HOLD, 0.5, "link"),
     Row("link", late_link, "limits.link_growth_s", HOLD, 0.5, "link"),
-    Row("uplink", unanswered, "limits.silence_s", HOLD, 0.5, "link"),
+    Row("uplink", replies_overdue, "limits.silence_s", HOLD, 0.5, "link"),
     Row("decision", decision_missed, "one", LEVEL, cause=MISSED),
     Row("decisions", decisions_missed, "limits.missed_decisions", LAND, cause=MISSED),
     Row("tilt", tilted, "limits.tilt_rad", LAND),

@@ -81,7 +81,7 @@ class ParameterReading:
         return timeout or not self._missing(dialect, vehicle)
 
     def _missing(self, dialect: Dialect, vehicle: VehicleState) -> list[str]:
-        unanswered = dialect.unanswered(vehicle.parameters)
+        unanswered = dialect.without_reply(vehicle.parameters)
         return [each.name for each in unanswered if self._advice or not each.advice_only]
 
 
@@ -175,7 +175,7 @@ def refusals(ground: Ground) -> list[str]:
     return [found.sentence for _, at_once, found in findings(ground) if at_once]
 
 
-def not_ready(ground: Ground) -> str:
+def awaited(ground: Ground) -> str:
     """Why it cannot be flown yet, in one sentence; empty if nothing is to be waited for."""
     waiting = (found.sentence for _, at_once, found in findings(ground) if not at_once)
     return next(waiting, "")
@@ -390,7 +390,7 @@ def _empty_battery(ground: Ground) -> str:
     return f"its battery has {charge:.0%} left, limits.battery is {least:.0%}"
 
 
-def unanswered(for_s: float) -> str:
+def no_reply_for(for_s: float) -> str:
     """The sentence that no TIMESYNC request was answered for `for_s`; empty for a short time."""
     if for_s < UNANSWERED_S:
         return ""
@@ -401,7 +401,7 @@ def _measuring(ground: Ground) -> str:
     clock, host_s = ground.clock, ground.host_s
     if clock.delay_is_measured(host_s):
         return ""
-    return unanswered(clock.unanswered_s(host_s)) or "the delay of the link is being measured"
+    return no_reply_for(clock.unanswered_s(host_s)) or "the delay of the link is being measured"
 
 
 def _late(ground: Ground) -> str:

@@ -59,10 +59,10 @@ def refused(flight: FlightState) -> str:
 def unfit(flight: FlightState) -> str:
     """What the preflight list refuses at once, and the first problem that it waits for; empty if
     there is neither."""
-    return "; ".join(filter(None, [*preflight.refusals(flight), preflight.not_ready(flight)]))
+    return "; ".join(filter(None, [*preflight.refusals(flight), preflight.awaited(flight)]))
 
 
-def usable(flight: FlightState) -> bool:
+def is_fit(flight: FlightState) -> bool:
     return not unfit(flight)
 
 
@@ -94,7 +94,7 @@ def firmware_unknown(flight: FlightState) -> bool:
     MAV_TYPE of a multirotor (Q_MAV_TYPE), and the numbers of its modes mean others: 4, GUIDED of
     ArduCopter, is ACRO."""
     dialect, known = flight.dialect, flight.vehicle.parameters
-    return dialect is None or any(each.must_answer for each in dialect.unanswered(known))
+    return dialect is None or any(each.must_answer for each in dialect.without_reply(known))
 
 
 def can_take_over(flight: FlightState) -> bool:
@@ -106,7 +106,7 @@ def can_take_over(flight: FlightState) -> bool:
 
 
 def engaged_by_pilot(flight: FlightState) -> str:
-    fit = flight.pilot is PilotSwitch.ENGAGED and can_take_over(flight) and usable(flight)
+    fit = flight.pilot is PilotSwitch.ENGAGED and can_take_over(flight) and is_fit(flight)
     return f"engaged: {flight.vehicle.mode} in the air" if fit else ""
 
 
@@ -186,7 +186,7 @@ def engaged(flight: FlightState) -> str:
 
 
 def not_engaged(flight: FlightState) -> str:
-    unanswered = preflight.unanswered(flight.clock.unanswered_s(flight.host_s))
+    unanswered = preflight.no_reply_for(flight.clock.unanswered_s(flight.host_s))
     return (
         f"the vehicle did not enter {flight.authority.engage_mode} in {flight.in_phase_s:.0f} s "
         f"(it shows {flight.vehicle.mode})" + (unanswered and f"; {unanswered}")
@@ -264,7 +264,7 @@ FLY_BEGINS = (
     Transition({HEALTH}, silent_on_ground, FAILED, REFUSED, "link"),
     Transition({HEALTH}, stop_requested, FAILED, REFUSED, OPERATOR, BEFORE_TAKEOFF),
     Transition({HEALTH}, refused, FAILED, REFUSED),
-    Transition({HEALTH}, usable, STREAM, reason="telemetry flows and the vehicle can arm"),
+    Transition({HEALTH}, is_fit, STREAM, reason="telemetry flows and the vehicle can arm"),
     Transition({HEALTH}, only_mode_is_unfit, STREAM),
     Transition({HEALTH}, longer_than("health_s", not_ready), FAILED, REFUSED),
 )
@@ -279,7 +279,7 @@ SERVICE_BEGINS = (
     Transition({HEALTH, STANDBY}, engaged_but_unfit, HAND_BACK, REFUSED),
     Transition({HEALTH, STANDBY}, stop_requested, FAILED, FLOWN, OPERATOR),
     Transition({STANDBY}, not_for_this_vehicle, HEALTH),
-    Transition({HEALTH}, usable, STANDBY, reason="telemetry flows"),
+    Transition({HEALTH}, is_fit, STANDBY, reason="telemetry flows"),
     Transition({STANDBY}, engaged_too_soon, HAND_BACK, REFUSED, reason=TOO_SOON),
     Transition({STANDBY}, started_in_the_air, CLIMB, FLOWN),
     Transition({STANDBY}, started_on_the_ground, STREAM, reason="start requested"),

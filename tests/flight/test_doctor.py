@@ -269,7 +269,7 @@ def test_angular_acceleration_parameters_are_converted_by_release() -> None:
 )
 def test_parameters_of_another_release_are_not_awaited(replies: str) -> None:
     known = dict.fromkeys(replies.split(), 1.0)
-    missing = {each.name for each in DIALECTS["ardupilot"].unanswered(known)}
+    missing = {each.name for each in DIALECTS["ardupilot"].without_reply(known)}
     assert missing == {
         "GUID_OPTIONS", "GUID_TIMEOUT", "MOT_THST_HOVER", "ATC_ANGLE_BOOST", "FS_GCS_ENABLE",
         "FS_THR_ENABLE", "ATC_RATE_R_MAX", "ATC_RATE_P_MAX",

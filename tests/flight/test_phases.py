@@ -163,7 +163,7 @@ def _engage_refused(flight: FlightState) -> None:
 # condition -> function that makes it hold
 EVENTS: dict[str, Setup] = {
     "vehicle_found": lambda flight: vars(flight.session).update(vehicle=VehicleFound(1, 1, "px4")),
-    "usable": _fit,
+    "is_fit": _fit,
     "refused": lambda flight: vars(flight.session).update(refusals=["no multirotor"]),
     "only_mode_is_unfit": _all(
         _since(10.1), lambda flight: vars(flight.session).update(only_mode=True)
@@ -234,13 +234,13 @@ EVENTS: dict[str, Setup] = {
 def preflight_list(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the preflight list find what `EVENTS` sets."""
 
-    def not_ready(ground: Any) -> str:
+    def awaited(ground: Any) -> str:
         return "" if vars(ground.session).get("ready") else "not yet"
 
     def refusals(ground: Any) -> list[str]:
         return vars(ground.session).get("refusals", [])
 
-    monkeypatch.setattr(preflight, "not_ready", not_ready)
+    monkeypatch.setattr(preflight, "awaited", awaited)
     monkeypatch.setattr(preflight, "refusals", refusals)
     monkeypatch.setattr(
         preflight, "only_mode_is_unfit", lambda ground: "only_mode" in vars(ground.session)

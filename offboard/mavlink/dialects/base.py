@@ -187,7 +187,7 @@ class Dialect:
         told = "\n".join(texts)
         return next((fix for part, fix in self.remedies.items() if part in told), "")
 
-    def unanswered(self, known: Mapping[str, float]) -> list[WatchedParameter]:
+    def without_reply(self, known: Mapping[str, float]) -> list[WatchedParameter]:
         """The watched parameters for which no name of any release has had a reply."""
         replied = {each.oldest for each in self.watched_parameters if each.name in known}
         return [each for each in self.watched_parameters if each.oldest not in replied]
