@@ -85,7 +85,7 @@ class FlightLog:
             os.close(descriptor)
             self.path.unlink()
             if not isinstance(error, FileExistsError):
-                configuration.unlink()
+                configuration.unlink(missing_ok=True)
             raise
         self.descriptor = descriptor
 

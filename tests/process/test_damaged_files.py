@@ -3,6 +3,7 @@ code, and no file that is incomplete. The log of a flight holds what was flown."
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import subprocess
@@ -18,7 +19,7 @@ from offboard.analysis import history, tlog
 from offboard.analysis.score import keep_score, score_flight
 from offboard.cli import fly
 from offboard.flight.record import configuration_pieces
-from offboard.link.log import LogError, entry
+from offboard.link.log import FlightLog, LogError, entry
 from offboard.mavlink.session import RECORD_COMPONENT_ID
 from offboard.report.flight import read
 from offboard.run import configuration as config
@@ -148,6 +149,18 @@ def test_commands_on_a_full_disk_leave_no_partial_file(
     assert "File too large" in said
     assert {path.name for path in tmp_path.iterdir()} == kept
     assert not list(tmp_path.glob("x/flight.*"))
+
+
+def test_a_log_whose_configuration_cannot_be_created_names_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "open", full)
+    with pytest.raises(LogError, match="No space left"):
+        FlightLog(tmp_path / "x", "").__enter__()
+    assert not list(tmp_path.glob("x/*"))
 
 
 # --- an output that takes nothing ---

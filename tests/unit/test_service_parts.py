@@ -215,7 +215,7 @@ def test_lock_names_its_holder_and_is_released_with_it(tmp_path: Path) -> None:
     with directory_lock(tmp_path / "new"), pytest.raises(Unavailable, match=ours):
         directory_lock(tmp_path / "new").__enter__()
     (tmp_path / "file").touch()
-    with pytest.raises(UserError, match=r"file/new \(--out\) cannot be opened: Not a directory"):
+    with pytest.raises(UserError, match=r"service.lock, .*file/new \(--out\): Not a directory"):
         directory_lock(tmp_path / "file/new").__enter__()
 
 
