@@ -104,8 +104,7 @@ def _end(flight: FlightState) -> None:
 
 
 def _await_link(flight: FlightState) -> None:
-    """Announce once that the landing waits for the link. When the vehicle is heard again, forget
-    earlier acknowledgements, so that land is requested again."""
+    """Announce once that the landing waits for the link, and when the vehicle is heard again."""
     unreached_s, limits = flight.unreached_s, flight.limits
     waited, flight.awaits_link = flight.awaits_link, unreached_s > 2.0 * limits.silence_s
     if flight.awaits_link and not waited:
@@ -117,7 +116,6 @@ def _await_link(flight: FlightState) -> None:
             f"{OUTAGE_MAX_S:.0f} s; landing is asked again once the vehicle is heard",
         )
     elif waited and not flight.awaits_link:
-        flight.vehicle.results.clear()
         outbox.announce(flight, f"heard again: the vehicle shows {flight.vehicle.mode}")
 
 
