@@ -29,7 +29,6 @@ REFERENCE_OVER = "reference over"
 NO_FLIGHT = "no flight of offboard in this log"
 _ON_GROUND = 1  # MAV_LANDED_STATE
 _LOWEST_M = 0.05  # least height above the takeoff point; references are at least 0.3 m above it
-_LANDING_ENDS = {"disarmed", "failed", "yielded"}
 
 
 def landing(flown: History) -> tuple[str, float]:
@@ -118,7 +117,7 @@ def _ended_early(flown: History) -> tuple[str, str]:
     took_over = [event.what for event in flown.announcements if event.cause == SUPERVISOR]
     if took_over:
         return SUPERVISOR, took_over[0]
-    if names[-1] not in _LANDING_ENDS:
+    if names[-1] not in {"disarmed", "failed", "yielded"}:
         return f"the log ends in the phase {names[-1]}", ""
     return REFERENCE_OVER if "hover" in names else "the log lacks a part of the flight", ""
 

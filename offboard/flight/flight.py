@@ -81,8 +81,7 @@ class Flight(FlightState):
             outbox.send(self, *due, *replies)
         finally:
             self._inputs.end()
-        peer = self.session.peer
-        self.overhear([chunk.data for chunk in chunks if peer not in (None, chunk.peer)])
+        self.overhear([each.data for each in chunks if self.session.peer not in (None, each.peer)])
         frames = outbox.flush(self)
         self._logged += frames
         return frames

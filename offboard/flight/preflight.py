@@ -156,8 +156,7 @@ def findings(ground: Ground) -> Iterator[tuple[str, bool, Finding]]:
         found = "" if row.fly_only and ground.service else row.problem(ground)
         if found:
             level = row.level if isinstance(row.level, Level) else row.level(ground)
-            fix = row.fix
-            fix = fix.format(ground=ground) if isinstance(fix, str) else fix(ground)
+            fix = row.fix.format(ground=ground) if isinstance(row.fix, str) else row.fix(ground)
             yield row.check, row.at_once, Finding(level, found, fix)
     for parameter in ground.known_dialect.watched_parameters:
         name, value = parameter.name, ground.vehicle.parameters.get(parameter.name)

@@ -63,8 +63,7 @@ DISARMED_SHOWN = (
 
 def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: float) -> bool:
     """Update the flight with one event. `arrived_s` is the host time at which the event arrived,
-    `turned_s` is the host time of the turn. Returns False if the event only repeats an earlier one
-    (see `VehicleState.update`)."""
+    `turned_s` is the host time of the turn. Returns False where `VehicleState.update` does."""
     if isinstance(event, Parameter):
         _announce_change(flight, event)
     if not flight.vehicle.update(event, flight.session.link_time_s):
