@@ -212,7 +212,7 @@ class Flight(FlightState):
             landing=self.phase is Phase.LAND,
             setpoint_loss=authority.setpoint_loss,
             sticks=health is not None and health.radio_ok,
-            supplied_s=-math.inf if missing else self.host_s,
+            setpoint_s=-math.inf if missing else self.setpoint_s,
         )
 
     def _status(self) -> tuple[int, int]:

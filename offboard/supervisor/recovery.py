@@ -49,8 +49,8 @@ class Supervised:
     report that arrived at `reported_s` (`clock.monotonic_s`); the supervisor judges its age.
     `flying`: whether the vehicle is armed. `holding`: whether hold was requested, so that the mode
     hold is ours, too. `landing`: whether land was requested. `setpoint_loss`: what the autopilot
-    does without setpoints. `sticks`: whether it receives a pilot's sticks. `supplied_s`: until
-    when setpoints were sent; -inf if they were missing already, or the failsafe for that acts."""
+    does without setpoints. `sticks`: whether it receives a pilot's sticks. `setpoint_s`: when the
+    newest setpoint was sent; -inf if they were missing already, or the failsafe for that acts."""
 
     vehicle: VehicleFound
     ours: bool
@@ -60,7 +60,7 @@ class Supervised:
     landing: bool = False
     setpoint_loss: SetpointLoss = NEVER
     sticks: bool = False
-    supplied_s: float = -math.inf
+    setpoint_s: float = -math.inf
 
     @property
     def silent_s(self) -> float:
@@ -79,7 +79,7 @@ class Recovery:
         self._dialect, self._known = dialect, known
         self._hold_s = 0.0 if known.landing else HOLD_S
         self._began_s = began_s
-        self._loses_s = known.supplied_s + known.setpoint_loss.after_s - EARLY_S
+        self._loses_s = known.setpoint_s + known.setpoint_loss.after_s - EARLY_S
         self._sticks = known.sticks
         self._mode: str | None = None
         self._before: str | None = None  # the mode before it

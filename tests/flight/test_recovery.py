@@ -29,7 +29,7 @@ from simulator.steps import STEP_S
 HOLD, LAND = 176, 21  # MAV_CMD_DO_SET_MODE, MAV_CMD_NAV_LAND
 FIRMWARES = pytest.mark.parametrize("dialect", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
 VEHICLE = VehicleFound(1, 1, "px4")
-OURS = Supervised(VEHICLE, ours=True, flying=True, reported_s=math.inf, supplied_s=0.0)
+OURS = Supervised(VEHICLE, ours=True, flying=True, reported_s=math.inf, setpoint_s=0.0)
 DISARMED, TOO_LONG = "the vehicle is disarmed", f"not landed after {LONGEST_S:.0f} s"
 Timed = tuple[float, Event]
 ACCEPTED = (0.05, CommandAck(HOLD, "ACCEPTED"))

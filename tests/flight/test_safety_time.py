@@ -301,6 +301,9 @@ def test_setpoints_dropped_between_pauses_count_as_missing() -> None:
         pair.pause(0.5)
 
     def again(pair: Pair) -> None:
+        supervised = pair.companion.supervised
+        assert supervised is not None
+        assert -0.7 < supervised.setpoint_s - pair.host_s < -0.5  # not yet missing
         resumes_s[0] = math.inf
         pair.pause(0.55)
 

@@ -243,11 +243,11 @@ def test_stopped_supervisor_does_not_guard_until_it_continues(rig: Rig) -> None:
 
 
 def test_stopped_supervisor_recognises_the_vehicles_failsafe(rig: Rig) -> None:
-    """Beats contain the time until which setpoints were sent. Regression: counted from the time of
+    """Beats contain the time of the newest setpoint. Regression: counted from the time of
     reading, or of sending by a controller that was stopped within the turn, the failsafe seemed too
     early and so to be a pilot's choice."""
     known = replace(OURS, setpoint_loss=SetpointLoss(1.0, ("AUTO.LOITER",)))
-    begun = replace(known, supplied_s=clock.monotonic_s())
+    begun = replace(known, setpoint_s=clock.monotonic_s())
     os.kill(rig.supervisor.process.pid, signal.SIGSTOP)
     time.sleep(1.2)
     rig.beat(begun)
