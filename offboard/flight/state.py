@@ -336,7 +336,7 @@ class FlightState(Ground):
         if self.touchdown is None:
             return "it was not told to land"
         if not self.contact.position_known:
-            return "no LOCAL_POSITION_NED arrives to show it"
+            return "no new LOCAL_POSITION_NED arrives to show it"
         return self.touchdown.not_landed(on_ground=self.contact.detected == "on_ground")
 
     def delays_begin_s(self, time_s: float) -> float:

@@ -83,7 +83,7 @@ def test_growing_link_delay_ends_in_hold_and_landing(scenario: str, on: Vehicle)
 POSITION, ATTITUDE = "LOCAL_POSITION_NED", "ATTITUDE_QUATERNION"
 NO_POSITION, NOT_SHOWN = (
     "no new LOCAL_POSITION_NED for 0.[56] s",
-    "disarmed, landing not confirmed: no LOCAL_POSITION_NED arrives to show it",
+    "disarmed, landing not confirmed: no new LOCAL_POSITION_NED arrives to show it",
 )
 # vehicle, message, its fields that repeat (none: all), event and time of the fault, sentence
 STUCK = {
