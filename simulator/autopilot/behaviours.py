@@ -248,12 +248,12 @@ class Orbit(ActiveBehaviour):
         outward_mps = radius_m - math.hypot(x - north, y - east)
         along_mps = math.copysign(circle.speed_mps, circle.radius_m)
         inward_mps2 = along_mps**2 / radius_m
-        turned_rad = {0: math.pi, 3: math.copysign(0.5 * math.pi, along_mps)}  # to centre, tangent
+        offset_rad = {0: math.pi, 3: math.copysign(0.5 * math.pi, along_mps)}  # to centre, tangent
         return MotionSetpoint(
             (math.nan, math.nan, down),
             (outward_mps * cos - along_mps * sin, outward_mps * sin + along_mps * cos, math.nan),
             (-inward_mps2 * cos, -inward_mps2 * sin, math.nan),
-            wrap_pi(bearing_rad + turned_rad.get(circle.yaw, math.nan)),
+            wrap_pi(bearing_rad + offset_rad.get(circle.yaw_behaviour, math.nan)),
         )
 
 

@@ -108,7 +108,7 @@ class Circle:
     centre_ned_m: Triple
     radius_m: float  # negative: anticlockwise
     speed_mps: float
-    yaw: int  # ORBIT_YAW_BEHAVIOUR
+    yaw_behaviour: int  # ORBIT_YAW_BEHAVIOUR
 
 
 @dataclass(frozen=True, slots=True)

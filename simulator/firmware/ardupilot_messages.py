@@ -100,7 +100,7 @@ def rc_channels(view: View) -> Sequence[Any]:
 
 def raw_imu(view: View) -> Sequence[Any]:
     """True specific force in mg, estimated rates in mrad/s, magnetic field of SITL in mgauss."""
-    return (view.time_us, *view.imu_counts, 224, 80, -528, 0, 2500)
+    return (view.time_us, *view.scaled_imu, 224, 80, -528, 0, 2500)
 
 
 def servo_output_raw(view: View) -> Sequence[Any]:

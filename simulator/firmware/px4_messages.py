@@ -151,7 +151,7 @@ def actuator_output_status(view: View) -> Sequence[Any]:
 
 def scaled_imu(view: View) -> Sequence[Any]:
     """The values of HIGHRES_IMU, but in mg, mrad/s and mgauss."""
-    return (view.time_ms, *view.imu_counts, 210, 0, 430, 1500)
+    return (view.time_ms, *view.scaled_imu, 210, 0, 430, 1500)
 
 
 def highres_imu(view: View) -> Sequence[Any]:

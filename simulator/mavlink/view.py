@@ -97,7 +97,7 @@ class View:
         return forward, right, down
 
     @property
-    def imu_counts(self) -> list[int]:
+    def scaled_imu(self) -> list[int]:
         """True specific force in mg and estimated rates in mrad/s, FRD."""
         per_mg, rates = GRAVITY_MPS2 * 1e-3, self.autopilot.state.estimate.rates_frd_radps
         force = (value / per_mg for value in self.specific_force)
