@@ -118,13 +118,15 @@ class FlightPlan:
     ) -> float:
         """Place the track so that it starts where a vehicle with this position and velocity can
         come to rest. Raise it until its lowest point is at least `CLEAR_M` above the ground, or not
-        below the vehicle if the ground is not known (None). Returns by how much it was raised, m.
+        below the vehicle and its place of rest if the ground is not known (None). Returns by how
+        much it was raised, m.
         """
         times_s = np.arange(0.0, self.track.duration_s + SAMPLED_S, SAMPLED_S)
         places = self.track.sample(times_s).position_ned_m
-        origin = stopping_place(position_ned_m, velocity_ned_mps) - places[0]
+        rest = stopping_place(position_ned_m, velocity_ned_mps)
+        origin = rest - places[0]
         lowest_m = float(origin[2]) + float(places[:, 2].max())
-        least_m = position_ned_m[2]
+        least_m = max(position_ned_m[2], float(rest[2]))
         if ground_down_m is not None:
             clear_m = ground_down_m - CLEAR_M
             # a vehicle that hovers lower shows how low is safe; one that is landing does not
