@@ -119,7 +119,7 @@ class Firmware(ABC):
     # and its yaw and speed are ignored; the height of MAV_CMD_NAV_TAKEOFF is above home;
     # MAV_CMD_MISSION_START must not name an item. Item 0 of a mission is home, a takeoff item does
     # not make the vehicle descend, disarming resets the mission, and a MISSION_ITEM with current =
-    # 2 is a place to fly to at once.
+    # 2 is a place to fly to at once. A mission under way cannot be cleared.
     # False: as in PX4. The height of MAV_CMD_NAV_TAKEOFF is above mean sea level; a landing item
     # counts as reached already above its place
     ardupilot_commands: bool = False
@@ -144,6 +144,9 @@ class Firmware(ABC):
     requests_kind_of_peer: bool = False  # requests items with or without _INT, as the peer last did
     # MAV_FRAME of a downloaded item, by its message and the MAV_FRAME of the upload
     item_frames: Mapping[str, Mapping[int, int]]
+    frameless_items: frozenset[int] = (
+        frozenset()
+    )  # MAV_CMDs of items that are downloaded in frame 0
     mission_text: StatusText | None = None  # text after an upload
     # MAV_CMD -> name in the texts about the progress of a mission; without names there are none
     item_titles: Mapping[int, str] = field(default_factory=dict)
@@ -241,8 +244,9 @@ class Firmware(ABC):
         return None
 
     @abstractmethod
-    def mission_refusal(self, item: MissionItem, *, whole: bool) -> Refusal | None:
-        """Return MAV_MISSION_RESULT and text of the refusal of an item; None: it is accepted.
+    def mission_refusal(self, item: MissionItem, kind: int, *, whole: bool) -> Refusal | None:
+        """Return MAV_MISSION_RESULT and text of the refusal of an item of MAV_MISSION_TYPE `kind`;
+        None: it is accepted.
         `whole`: whether it came as MISSION_ITEM_INT."""
 
     def is_ground_station(self, kind: int, system: int, parameters: ParameterValues) -> bool:

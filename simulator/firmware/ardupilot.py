@@ -65,14 +65,18 @@ _OFFSET = frozenset({_LOCAL_OFFSET_NED, _BODY_NED, _BODY_OFFSET_NED})
 _BODY = frozenset({_BODY_NED, _BODY_OFFSET_NED})
 
 _UNSUPPORTED_FRAME, _UNSUPPORTED, _INVALID_PARAM1 = 2, 3, 6  # MAV_MISSION_RESULT
-_PLACE_FRAMES = frozenset({0, 3, 5, 6, 10, 11})
+_PLACE_FRAMES = frozenset({0, 2, 3, 5, 6, 10, 11})
 _ITEM_FRAMES = {2: 0, 5: 0, 6: 3, 11: 10}  # frame of an uploaded item -> of the downloaded one
-_PLACES = frozenset({16, 17, 18, 19, 21, 22, 31, 82, 201})  # MAV_CMDs of items with a place
+# MAV_CMDs of items with a place
+_PLACES = frozenset({
+    16, 17, 18, 19, 21, 22, 31, 82, 84, 85, 94, 179, 188, 189, 191, 195, 201,
+})  # fmt: skip
+_STORED = {1: frozenset(range(5000, 5005)), 2: frozenset({5100})}  # items of fences, rally points
 _YAWED = frozenset({16, 17, 21, 22})  # items whose param4 may be NaN
 _ACTS = frozenset({
-    20, 30, 83, 84, 85, 92, 93, 94, 112, 114, 115, 177, 178, 179, 181, 182, 183, 184, 188, 189,
-    191, 193, 194, 195, 197, 202, 203, 205, 206, 207, 208, 210, 211, 212, 213, 215, 216, 217, 218,
-    222, 223, 531, 532, 534, 600, 601, 1000, 2000, 2001, 2500, 2501, 3000, 42600, 42702, 42703,
+    20, 30, 83, 92, 93, 112, 114, 115, 177, 178, 181, 182, 183, 184, 193, 194, 197, 202, 203, 205,
+    206, 207, 208, 210, 211, 212, 213, 215, 216, 217, 218, 222, 223, 531, 532, 534, 600, 601, 1000,
+    2000, 2001, 2500, 2501, 3000, 42600, 42702, 42703,
 })  # fmt: skip
 
 _TITLES = {
@@ -196,7 +200,9 @@ class ArduCopter(Firmware):
             local[name] += here_m
         return local
 
-    def mission_refusal(self, item: MissionItem, *, whole: bool) -> Refusal | None:
+    def mission_refusal(self, item: MissionItem, kind: int, *, whole: bool) -> Refusal | None:
+        if kind:
+            return None if item.command in _STORED[kind] else (_UNSUPPORTED, None)
         for number, value in enumerate(item.params):
             may_be_nan = number == 3 and item.command in _YAWED and math.isnan(value)
             if not (math.isfinite(value) or may_be_nan):
@@ -276,6 +282,7 @@ ARDUPILOT = ArduCopter(
     global_frames=frozenset({0, 3, 5, 6, 10, 11}),
     ardupilot_setpoints=True,
     item_frames={"MISSION_ITEM": _ITEM_FRAMES, "MISSION_ITEM_INT": _ITEM_FRAMES},
+    frameless_items=_ACTS,
     mission_text=info("Flight plan received"),
     item_titles=_TITLES,
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,

@@ -185,7 +185,9 @@ class Px4(Firmware):
             return critical(f"{message} invalid coordinate frame {frame}")
         return critical(f"{message} coordinate frame {frame} unsupported")
 
-    def mission_refusal(self, item: MissionItem, *, whole: bool) -> Refusal | None:
+    def mission_refusal(self, item: MissionItem, kind: int, *, whole: bool) -> Refusal | None:
+        if kind:
+            return None
         by_place = item.frame in (_PLACE_FRAMES | _INT_FRAMES if whole else _PLACE_FRAMES)
         if not by_place and item.frame != _COMMAND_FRAME:
             return _UNSUPPORTED_FRAME, _INVALID

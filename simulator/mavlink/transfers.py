@@ -175,7 +175,7 @@ class MissionTransfer:
         if (peer, kind, message.seq) != expected:  # a duplicate
             return
         item = _read(message)
-        refused = None if kind else self._firmware.mission_refusal(item, whole=self._whole)
+        refused = self._firmware.mission_refusal(item, kind, whole=self._whole)
         if refused is not None:
             result, text = refused
             self._acknowledge(upload.peer, result, upload.kind)
@@ -214,8 +214,9 @@ class MissionTransfer:
     def request_list(self, message: Message) -> None:
         """Handle MISSION_REQUEST_LIST."""
         kind = message.mission_type
-        count = len(self.mission.stored.get(kind, ()))
-        self.outbox.send("MISSION_COUNT", *sender_of(message), count, kind)
+        if not self._refuses(message):
+            count = len(self.mission.stored.get(kind, ()))
+            self.outbox.send("MISSION_COUNT", *sender_of(message), count, kind)
 
     def request(self, message: Message) -> None:
         """Handle MISSION_REQUEST or MISSION_REQUEST_INT of a download."""
@@ -231,6 +232,7 @@ class MissionTransfer:
         current = int(not kind and message.seq == self.mission.current)
         name = "MISSION_ITEM_INT" if whole else "MISSION_ITEM"
         frame = self._firmware.item_frames[name].get(item.frame, item.frame)
+        frame = 0 if item.command in self._firmware.frameless_items else frame
         head = (*peer, message.seq, frame, item.command)
         self.outbox.send(name, *head, current, 1, *item.params, *places, item.z, kind)
 
@@ -243,8 +245,22 @@ class MissionTransfer:
         place = view.geodetic(north_m, east_m)
         return MissionItem(0, Kind.WAYPOINT, (0.0,) * 4, *place, view.altitude_mm(down_m) * 1e-3)
 
+    def _refuses(self, message: Message) -> bool:
+        """Refuse an unknown MAV_MISSION_TYPE, also ALL_KINDS, as ArduCopter does."""
+        kind = message.mission_type
+        refused = self._firmware.ardupilot_commands and kind not in self.mission.stored
+        if refused:
+            self._acknowledge(sender_of(message), Ack.UNSUPPORTED, kind)
+        return refused
+
     def clear_all(self, message: Message) -> None:
         """Handle MISSION_CLEAR_ALL."""
+        if self._refuses(message):
+            return
+        flown = self._firmware.ardupilot_commands and self.mission.under_way
+        if flown and not message.mission_type:
+            self._acknowledge(sender_of(message), Ack.ERROR, 0)
+            return
         for kind in self.mission.stored:
             if message.mission_type in (kind, ALL_KINDS):
                 self.mission.store((), kind)

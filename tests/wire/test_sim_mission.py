@@ -156,7 +156,8 @@ def test_missing_items_are_requested_again_until_a_timeout_or_cancelled() -> Non
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
 def test_fences_and_rally_points_are_kept_beside_the_mission(firmware: Firmware) -> None:
     """An inclusion fence and a rally point are stored as the mission is, and do not change it. Only
-    PX4 returns an item of frame 6 in that frame, as MISSION_ITEM_INT."""
+    PX4 returns an item of frame 6 in that frame, as MISSION_ITEM_INT; only ArduCopter refuses a
+    waypoint in a rally point's place, and MAV_MISSION_TYPE 255 (all), and has no frame 2."""
     bench = Bench(firmware=firmware)
     assert upload(bench, ROUND) == 0
     kept = {1: [place(5001, n, e, 0, 3) for n, e in ((9, 9), (9, -9), (-9, 0))],
@@ -171,14 +172,20 @@ def test_fences_and_rally_points_are_kept_beside_the_mission(firmware: Firmware)
         assert (last.command, last.mission_type) == (rows[-1][0], kind)
     send(bench, mavlink.MAVLink_mission_request_int_message(1, 1, 1))
     send(bench, mavlink.MAVLink_mission_request_message(1, 1, 1))
-    frames = [bench.of(kind)[-1][1].frame for kind in ("MISSION_ITEM_INT", "MISSION_ITEM")]
-    assert frames == [6 if firmware is PX4 else 3, 3]
+    send(bench, mavlink.MAVLink_mission_request_int_message(1, 1, 3))
+    frames = [m.frame for _, m in bench.received if m.get_type().startswith("MISSION_ITEM")]
+    assert frames[-3:] == ([6, 3, 2] if firmware is PX4 else [3, 3, 0])
     send(bench, mavlink.MAVLink_mission_clear_all_message(1, 1, 1))
     for kind, count in enumerate((len(ROUND), 0, 1)):
         send(bench, mavlink.MAVLink_mission_request_list_message(1, 1, kind))
         assert bench.of("MISSION_COUNT")[-1][1].count == count
     send(bench, mavlink.MAVLink_mission_count_message(1, 1, 1, 3))
     assert [(m.type, m.mission_type) for _, m in bench.of("MISSION_ACK")][-2:] == [(0, 1), (3, 3)]
+    refused = 0 if firmware is PX4 else 3
+    assert upload(bench, [place(WAYPOINT, 3, 4, 5)], 2) == refused
+    send(bench, mavlink.MAVLink_mission_clear_all_message(1, 1, 255))
+    assert acks(bench)[-1] == refused
+    assert (bench.instance.autopilot.mission.items == ()) is (firmware is PX4)
 
 
 @pytest.mark.parametrize(
@@ -253,6 +260,8 @@ def test_arducopter_mission_ignores_item_yaw_and_returns_in_auto() -> None:
     assert bench.command(300) == [0]
     bench.run_until(lambda: bool(bench.of("MISSION_ITEM_REACHED")), 15.0)
     assert bench.height_m == pytest.approx(5.0, abs=0.2)
+    send(bench, mavlink.MAVLink_mission_clear_all_message(1, 1))
+    assert acks(bench)[-1] == 1  # a mission that is flown is not cleared
     bench.run_until(lambda: bench.instance.autopilot.mission.finished, 30.0)
     assert bench.heading_deg == pytest.approx(90.0, abs=6.0)
     assert current(bench) == (3, 3, 1)
