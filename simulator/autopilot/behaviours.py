@@ -13,7 +13,7 @@ from dataclasses import replace
 from enum import Enum
 
 from offboard.model.frames import wrap_pi
-from simulator.autopilot.guidance import ActiveBehaviour, Guidance, stopping_place_ned_m
+from simulator.autopilot.guidance import ActiveBehaviour, Guidance
 from simulator.autopilot.state import StateEstimate
 from simulator.autopilot.values import NAN3, Behaviour, MotionSetpoint, Triple
 from simulator.steps import LOOP_S
@@ -192,7 +192,7 @@ class FlyBySticks(ActiveBehaviour):
         velocity, acceleration, climb_mps, turn_radps = demand
         if landed and climb_mps <= 0.0:
             return descend
-        (x, y, z), stop = guidance.hold_ned_m, stopping_place_ned_m(estimate)
+        (x, y, z), stop = guidance.hold_ned_m, guidance.stopping_place_ned_m(estimate)
         moves = math.hypot(*velocity) > _STILL_MPS
         x, y = stop[:2] if moves else (x, y)
         guidance.hold = MotionSetpoint((x, y, stop[2] if climb_mps else z))

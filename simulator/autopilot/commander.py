@@ -239,6 +239,10 @@ class Commander:
         self._guidance.newest = None
         self._controller.enter(self.mode.behaviour)
 
+    def _pause(self) -> None:
+        place = MotionSetpoint(self._guidance.stopping_place_ned_m(self._state.estimate))
+        self._guidance.paused = place if self._event == "pause" else None
+
     def _latch(self) -> None:
         self.latched |= {self._event}
 
@@ -281,6 +285,7 @@ ACTIONS: dict[str, Callable[[Commander], None]] = {
     "return": lambda c: c._controller.enter(Behaviour.RETURN),
     "hold": Commander._hold,
     "level": lambda c: c._controller.level_off(),
+    "pause": Commander._pause,
     "latch": Commander._latch,
     "reboot": Commander._reboot,
 }

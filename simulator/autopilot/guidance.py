@@ -104,6 +104,7 @@ class Guidance:
         self.home_yaw_rad = 0.0
         self.home_kept = False  # whether a client set home, which is then kept when it arms
         self.cruise_mps = math.inf  # speed requested for automatic flight; inf: none
+        self.paused: MotionSetpoint | None = None  # flown until the behaviour continues or ends
         # region of interest, faced until the next setpoint
         self.region_ned_m: tuple[float, float] | None = None
         self.circle = Circle(ORIGIN, 1.0, 1.0, 0)
@@ -121,10 +122,10 @@ class Guidance:
     ) -> None:
         """Begin a behaviour. `place_ned_m` is the place to which a takeoff climbs."""
         if not self.active.keeps_place(behaviour):
-            self.hold = MotionSetpoint(stopping_place_ned_m(estimate))
+            self.hold = MotionSetpoint(self.stopping_place_ned_m(estimate))
         if behaviour is not self.behaviour:
             self.cruise_mps = math.inf
-        self.region_ned_m = None
+        self.region_ned_m, self.paused = None, None
         self.active.leave()
         self.behaviour, self.active = behaviour, self._behaviours[behaviour](self)
         self._entered, self._place_ned_m = False, place_ned_m
@@ -156,6 +157,8 @@ class Guidance:
         if not self._entered:
             self._entered = True
             self.active.enter(estimate, self._place_ned_m, landed=landed)
+        if self.paused is not None:
+            return self.paused
         motion = self.active.motion(estimate, landed=landed)
         turns = not math.isnan(motion.yaw_rad) or not math.isnan(motion.yaw_rate_radps)
         if self.region_ned_m is None or turns or motion not in (self.hold, self.newest):
@@ -175,7 +178,8 @@ class Guidance:
     @property
     def setpoint(self) -> Setpoint | None:
         """The setpoint that the vehicle follows; None in other behaviours."""
-        return self.newest if self.behaviour is Behaviour.SETPOINT else None
+        follows = self.behaviour is Behaviour.SETPOINT and self.paused is None
+        return self.newest if follows else None
 
     @property
     def follows_attitude(self) -> bool:
@@ -224,11 +228,13 @@ class Guidance:
             limit_mps = min(limit_mps, self.cruise_mps)
         return min(limit_mps, self.active.speed_mps)
 
-
-def stopping_place_ned_m(estimate: StateEstimate) -> Triple:
-    """Place at which the vehicle stops if it brakes now."""
-    (x, y, z), (vx, vy, vz) = estimate.position_ned_m, estimate.velocity_ned_mps
-    return (x + 0.5 * vx, y + 0.5 * vy, z + 0.2 * vz)
+    def stopping_place_ned_m(self, estimate: StateEstimate) -> Triple:
+        """Place at which the vehicle stops if it brakes now."""
+        (x, y, z), (vx, vy, vz) = estimate.position_ned_m, estimate.velocity_ned_mps
+        role = self.parameters.role
+        braking_s = math.hypot(vx, vy) / max(role("stopping_mps2"), 0.1)
+        lasts_s = role("stopping_delay_s") + 0.5 * braking_s
+        return (x + lasts_s * vx, y + lasts_s * vy, z + 0.2 * vz)
 
 
 def _kind(setpoint: Setpoint | None) -> tuple[bool, ...]:

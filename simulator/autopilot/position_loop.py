@@ -59,7 +59,8 @@ class PositionLoop:
             self._integral_mps2 = [0.0, 0.0, 0.0]
         self._acceleration_mps2 = [0.0, 0.0, 0.0]  # derivative of the estimated velocity, filtered
         self._velocity_mps = NAN3  # estimated velocity in the last period
-        self._across_mps = self._down_mps = math.nan  # last speed setpoint under `Limits.smooth`
+        # last setpoint (north, east; down) under `Limits.smooth`
+        self._across_ned_mps, self._down_mps = (math.nan, math.nan), math.nan
         self._down_mps2 = 0.0  # last vertical acceleration that was demanded
 
     def forget_hover_thrust(self) -> None:
@@ -146,11 +147,14 @@ class PositionLoop:
         north, east, down = demanded
         speed = math.hypot(_or_zero(north), _or_zero(east))
         most = min(limits.across_mps, role("speed_xy_mps"))
-        if limits.smooth:
+        if limits.smooth and not math.isnan(motion.position_ned_m[0]):
             most = min(most, self._smooth_mps(speed, motion, velocity))
-            self._across_mps = min(speed, most)
         if speed > most:
             north, east = north * (most / speed), east * (most / speed)
+        if limits.smooth:
+            if math.isnan(motion.position_ned_m[0]):
+                north, east = self._smooth_across(north, east, velocity)
+            self._across_ned_mps = north, east
         if not math.isnan(down):
             if limits.smooth:
                 down = self._smooth_down_mps(down, velocity[2])
@@ -162,15 +166,22 @@ class PositionLoop:
     def _smooth_mps(self, speed_mps: float, motion: MotionSetpoint, velocity: Triple) -> float:
         """Return the greatest horizontal speed: acceleration since the last period is limited and,
         on the way to a place, the vehicle must be able to brake: v^2 = 2 a d, d = speed / gain."""
-        before_mps = self._across_mps
-        if math.isnan(before_mps):
-            before_mps = math.hypot(velocity[0], velocity[1])
-        most = before_mps + self._role("speeding_mps2") * LOOP_S
+        before = self._across_ned_mps
+        before = velocity[:2] if math.isnan(before[0]) else before
+        most = math.hypot(*before) + self._role("speeding_mps2") * LOOP_S
         gain_ps = self._role("position_xy_p")
         if math.isnan(motion.velocity_ned_mps[0]) and gain_ps > 0.0:
             squared = 2.0 * self._role("braking_mps2") * speed_mps / gain_ps
             most = min(most, math.sqrt(squared)) if squared >= 0.0 else most
         return most
+
+    def _smooth_across(self, north: float, east: float, velocity: Triple) -> tuple[float, float]:
+        """Return the horizontal velocity, with limited acceleration since the last period."""
+        before = self._across_ned_mps
+        x, y = velocity[:2] if math.isnan(before[0]) else before
+        change_mps = math.hypot(north - x, east - y)
+        share = min(1.0, self._role("speeding_mps2") * LOOP_S / max(change_mps, 1e-9))
+        return x + share * (north - x), y + share * (east - y)
 
     def _smooth_down_mps(self, down_mps: float, velocity_mps: float) -> float:
         """Return the vertical speed, with limited acceleration since the last period."""

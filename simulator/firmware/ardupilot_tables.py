@@ -193,6 +193,8 @@ ROLES: dict[str, Role] = {
     "turn_radps": lambda parameters: math.radians(parameters["ATC_SLEW_YAW"] * _CENTI),
     "speeding_mps2": ("WPNAV_ACCEL", _CENTI),
     "braking_mps2": ("WPNAV_ACCEL", 0.5 * _CENTI),
+    "stopping_mps2": ("WPNAV_ACCEL", _CENTI),
+    "stopping_delay_s": 0.4,
     "vertical_mps2": 2.5,
     "facing_mps": lambda parameters: (
         0.05 * (parameters["WPNAV_SPEED"] * _CENTI) if parameters["WP_YAW_BEHAVIOR"] else math.inf
@@ -319,6 +321,10 @@ RULES = (
     _fails("compass calibration", "armed", texts=(warning("Disarm to allow compass calibration"),)),
     Rule("loiter", when=("not position missing",), to="LOITER", send=_HEARTBEAT),
     Rule("loiter", result=_FAILED),
+    Rule("pause", "GUIDED AUTO", do=("pause",)),
+    Rule("continue", "GUIDED AUTO", do=("pause",)),
+    _fails("pause", texts=(info("Failed to pause"),)),
+    _fails("continue", texts=(info("Failed to resume"),)),
     Rule("mission progress", send=("MISSION_CURRENT",)),
     Rule("item reached", send=("MISSION_ITEM_REACHED",)),
     Rule("mission return", "AUTO", do=("return",)),  # the mode does not change

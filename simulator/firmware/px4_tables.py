@@ -215,6 +215,9 @@ ROLES: dict[str, Role] = {
     "turn_radps": ("MPC_YAWRAUTO_MAX", math.radians(1.0)),
     "speeding_mps2": ("MPC_ACC_HOR", 0.7),
     "braking_mps2": ("MPC_ACC_HOR", 0.5),
+    # a vehicle that stops brakes so, after a delay, as the jerk is limited
+    "stopping_mps2": "MPC_ACC_HOR",
+    "stopping_delay_s": 0.6,
     "vertical_mps2": ("MPC_ACC_DOWN_MAX", 0.5),
     # demanded speed above which the nose points in the direction of flight
     "facing_mps": lambda parameters: parameters["MPC_XY_P"] * parameters["NAV_ACC_RAD"],

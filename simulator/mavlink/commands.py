@@ -341,6 +341,7 @@ HANDLERS: dict[int, Callable[[Commands, Autopilot, Command], Result | None]] = {
     185: Commands._terminate,  # DO_FLIGHTTERMINATION
     186: Commands._change_altitude,  # DO_CHANGE_ALTITUDE
     192: Commands._reposition,  # DO_REPOSITION
+    193: lambda _, autopilot, asked: autopilot.handle("continue" if asked.params[0] else "pause"),
     195: Commands._face,  # DO_SET_ROI_LOCATION
     197: Commands._face,  # DO_SET_ROI_NONE
     201: Commands._face,  # DO_SET_ROI

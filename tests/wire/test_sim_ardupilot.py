@@ -374,6 +374,32 @@ def test_arducopter_integrates_an_acceleration_to_a_velocity() -> None:
     assert bench.velocity == pytest.approx((0.0, 0.0, 0.0), abs=0.3)
 
 
+@pytest.mark.parametrize(
+    ("speed_mps", "ends", "stops_m"),
+    [(3.0, "stream", 2.9), (8.0, "stream", 15.5), (3.0, "zero", 3.0), (8.0, "zero", 16.5),
+     (3.0, "BRAKE", 3.5), (8.0, "BRAKE", 15.5)],
+)  # fmt: skip
+def test_arducopter_stops_as_far_as_the_real_one(
+    speed_mps: float, ends: str, stops_m: float
+) -> None:
+    """When velocity setpoints end, GUID_TIMEOUT after the last one; when they demand zero; and in
+    BRAKE."""
+    bench = flying()
+
+    def go(north_mps: float) -> None:
+        fields = (0, 1, 1, 1, VELOCITY_ALONE, 0, 0, 0, north_mps, *(0.0,) * 7)
+        bench.send(mavlink.MAVLink_set_position_target_local_ned_message(*fields))
+
+    bench.run(6.0, lambda: go(speed_mps), 0.1)
+    if ends == "stream":
+        bench.run(2.9)
+    elif ends == "BRAKE":
+        bench.command(176, 1, BRAKE)
+    begun_m = bench.place[0]
+    bench.run(7.0, lambda: go(0.0) if ends == "zero" else None, 0.1)
+    assert bench.place[0] - begun_m == pytest.approx(stops_m, rel=0.15)
+
+
 def test_arducopter_reposition_moves_as_on_the_real_one() -> None:
     """Expected are metres from the start after each second. Only COMMAND_INT is accepted."""
     bench = flying()

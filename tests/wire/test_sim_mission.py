@@ -288,6 +288,30 @@ def test_arducopter_mission_restarted_in_the_air_stays_level() -> None:
     assert bench.place[0] == pytest.approx(12.0, abs=1.0)
 
 
+@pytest.mark.parametrize("mode", ["GUIDED", "AUTO"])
+def test_arducopter_pauses_and_continues(mode: str) -> None:
+    """MAV_CMD_DO_PAUSE_CONTINUE stops the vehicle on the way to a place; a place that it receives
+    meanwhile is flown to afterwards. Other modes refuse it."""
+    bench = aloft(firmware=ARDUPILOT, height_m=5.0, mode="GUIDED")
+    upload(bench, [place(TAKEOFF, 0, 0, 5)] * 2 + [place(WAYPOINT, 60, 0, 5)])
+    bench.position(60.0, 0.0, -5.0, 3576)
+    bench.instance.autopilot.commander.switch(mode)
+    bench.position(60.0, 0.0, -5.0, 3576)
+    bench.run(4.0)
+    assert bench.command(193, 0) == [0]
+    bench.run(5.0)
+    bench.position(40.0, 0.0, -5.0, 3576)
+    paused_m = bench.place[0]
+    bench.run(4.0)
+    assert bench.place[0] == pytest.approx(paused_m, abs=0.5)
+    assert bench.command(193, 1) == [0]
+    bench.run(9.0)
+    assert bench.place[0] == pytest.approx(40.0 if mode == "GUIDED" else 60.0, abs=3.0)
+    bench.instance.autopilot.commander.switch("LOITER")
+    assert [bench.command(193, resumes) for resumes in (0, 1)] == [[4], [4]]
+    assert bench.texts()[-2:] == ["Failed to pause", "Failed to resume"]
+
+
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT])
 def test_a_jump_repeats_a_part_of_the_mission(firmware: Firmware) -> None:
     """A jump is not reported as reached. A jump to an item that does not exist is skipped."""
