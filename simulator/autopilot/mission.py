@@ -236,6 +236,9 @@ class Mission:
         made = self._jumps.get(self.current, 0)
         if self.first <= target < len(self.items) and (times < 0 or made < times):
             self._jumps[self.current] = made + 1
+            if self.firmware.item_titles:
+                most = "unlimited" if times < 0 else f"{times:.0f}"
+                self.texts.append(info(f"Mission: {self.current} Jump {made + 1}/{most}"))
             self._go_on(int(target))
         else:
             self._advance()
@@ -260,6 +263,8 @@ class Mission:
         titles = self.firmware.item_titles
         if self._has_item and (title := titles.get(self.items[self.current].command)):
             self.texts.append(info(f"Mission: {self.current} {title}"))
+            if self.items[self.current].command == Kind.DELAY:
+                self.texts.append(info(f"Delaying {self.items[self.current].params[0]:.0f} sec"))
 
     def _finish(self, event: str) -> None:
         self.finished = True

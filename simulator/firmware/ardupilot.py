@@ -81,8 +81,10 @@ _ACTS = frozenset({
 
 _TITLES = {
     16: "WP", 17: "LoitUnlim", 18: "LoitTurns", 19: "LoitTime", 20: "RTL", 21: "Land",
-    22: "Takeoff", 31: "LoitAltitude", 82: "SplineWP", 93: "Delay", 115: "CondYaw",
-    178: "ChangeSpeed", 183: "SetServo", 195: "SetROILocation", 197: "SetROINone", 201: "SetROI",
+    22: "Takeoff", 31: "LoitAltitude", 82: "SplineWP", 93: "Delay", 112: "CondDelay",
+    115: "CondYaw", 178: "ChangeSpeed", 181: "SetRelay", 183: "SetServo", 189: "LandStart",
+    195: "SetROILocation", 197: "SetROINone", 201: "SetROI", 203: "DigiCamCtrl",
+    205: "MountControl", 206: "SetCamTrigDst", 207: "FenceEnable", 211: "Gripper",
 }  # fmt: skip
 
 _RETURN_LEAST_M = 2.0  # RTL_ALT_MIN

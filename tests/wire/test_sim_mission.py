@@ -314,14 +314,19 @@ def test_arducopter_pauses_and_continues(mode: str) -> None:
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT])
 def test_a_jump_repeats_a_part_of_the_mission(firmware: Firmware) -> None:
-    """A jump is not reported as reached. A jump to an item that does not exist is skipped."""
+    """A jump is not reported as reached. A jump to an item that does not exist is skipped.
+    ArduCopter says which items begin, how often it has jumped, and how long it waits."""
     bench = aloft(firmware=firmware, height_m=5.0)
     points = [place(WAYPOINT, north, 0, 5, 0, 0, 0, 0) for north in (0, 0, 8)]
-    upload(bench, [*points, act(JUMP, 1, 2), act(JUMP, 99, -1), place(WAYPOINT, 0, 8, 5)])
+    jumps = [act(JUMP, 1, 2), act(JUMP, 99, -1)]
+    upload(bench, [*points, *jumps, place(WAYPOINT, 0, 8, 5), act(93, 1, -1, -1, -1)])
     send(bench, mavlink.MAVLink_mission_set_current_message(1, 1, 1))
     bench.command(300)
     bench.run_until(lambda: bench.instance.autopilot.mission.finished, 60.0)
-    assert [m.seq for _, m in bench.of("MISSION_ITEM_REACHED")] == [1, 2] * 3 + [5]
+    assert [m.seq for _, m in bench.of("MISSION_ITEM_REACHED")] == [1, 2] * 3 + [5, 6]
+    told = [text for text in bench.texts() if "Jump" in text or "Delay" in text]
+    said = ["Mission: 3 Jump 1/2", "Mission: 3 Jump 2/2"]
+    assert told == ([] if firmware is PX4 else [*said, "Mission: 6 Delay", "Delaying 1 sec"])
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT])
