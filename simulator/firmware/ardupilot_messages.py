@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from offboard.model.frames import euler_from_quaternion
@@ -17,20 +17,20 @@ COMPANION_RATES_HZ = GROUND_RATES_HZ = {"HEARTBEAT": 1.0, "TIMESYNC": 0.1}
 
 # MAV_DATA_STREAM
 GROUPS = {
-    1: ("RAW_IMU", "SCALED_PRESSURE"),
+    1: ("RAW_IMU", "SCALED_PRESSURE", "SCALED_PRESSURE2"),
     2: (
         "SYS_STATUS", "MISSION_CURRENT", "GPS_RAW_INT", "NAV_CONTROLLER_OUTPUT",
-        "POSITION_TARGET_GLOBAL_INT",
+        "POSITION_TARGET_GLOBAL_INT", "POWER_STATUS", "MEMINFO",
     ),
     3: ("RC_CHANNELS", "SERVO_OUTPUT_RAW"),
     6: ("GLOBAL_POSITION_INT", "LOCAL_POSITION_NED"),
-    10: ("ATTITUDE",),
+    10: ("ATTITUDE", "AHRS2"),
     11: ("VFR_HUD",),
-    12: ("SYSTEM_TIME", "BATTERY_STATUS", "EKF_STATUS_REPORT", "VIBRATION"),
+    12: ("SYSTEM_TIME", "BATTERY_STATUS", "EKF_STATUS_REPORT", "VIBRATION", "WIND"),
 }  # fmt: skip
 NEVER_SENT = frozenset({
-    22, 26, 34, 35, 100, 105, 116, 124, 125, 127, 128, 129, 132, 133, 136, 137,
-    143, 152, 162, 163, 164, 165, 168, 173, 178, 180, 191, 192, 194, 195, 225, 226, 235, 246,
+    22, 26, 34, 35, 100, 105, 116, 124, 127, 128, 129, 132, 133, 136,
+    143, 162, 163, 164, 165, 173, 180, 191, 192, 194, 195, 225, 226, 235, 246,
     259, 260, 262, 269, 271, 277, 280, 281, 285, 286, 295, 301, 373, 376, 9005,
 })  # fmt: skip
 
@@ -149,3 +149,17 @@ def mission_current(view: View) -> Sequence[Any]:
             state = _ACTIVE if returns else _COMPLETE
     number = mission.current if begun else 0
     return (number, max(0, len(mission.items) - 1), state, int(in_auto))
+
+
+def ahrs2(view: View) -> Sequence[Any]:
+    """The second estimator: it agrees with the first one."""
+    _, latitude, longitude, height_mm, *_ = messages.global_position_int(view)
+    return (*messages.attitude(view)[1:4], height_mm * 1e-3, latitude, longitude)
+
+
+ROWS: dict[str, Callable[[View], Sequence[Any]]] = {
+    "MEMINFO": lambda _: (0, 65535, 524288),
+    "POWER_STATUS": lambda _: (5000, 0, 0),
+    "SCALED_PRESSURE2": messages.scaled_pressure,
+    "WIND": lambda _: (-180.0, 0.0, 0.0),  # without an airspeed sensor, no wind is estimated
+}

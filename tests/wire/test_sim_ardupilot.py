@@ -73,6 +73,11 @@ def test_arducopter_streams_a_requested_group_also_after_an_interval_of_0() -> N
         since_s = vehicle.time_s
         vehicle.run(3.0)
         assert len(vehicle.of("GLOBAL_POSITION_INT", since_s)) == pytest.approx(3 * rate_hz, abs=1)
+    vehicle.send(mavlink.MAVLink_request_data_stream_message(1, 1, 0, 4, 1))
+    vehicle.run(5.0)
+    for name in ("AHRS2", "MEMINFO", "POWER_STATUS", "SCALED_PRESSURE2", "WIND"):
+        assert len(vehicle.of(name)) == pytest.approx(20, abs=1), name
+    assert vehicle.of("AHRS2")[-1][1].altitude == pytest.approx(ARDUPILOT.origin[2], abs=0.5)
     places = [(m.lat, m.lon) for _, m in vehicle.of("GLOBAL_POSITION_INT")]
     assert places[0] == (0, 0)
     assert places[-1] == pytest.approx([value * 1e7 for value in ARDUPILOT.origin[:2]], abs=100)
