@@ -90,7 +90,13 @@ PARAMETERS = (
     _int8("COMPASS_USE", 1),  # without effect
     _int8("DISARM_DELAY", 10),  # s armed on the ground until disarming, 0 never
     _int8("EK3_ENABLE", 1),  # without effect
-    _int8("FENCE_ENABLE", 0),  # without effect: there is no fence
+    _int8("FENCE_ACTION", 1),  # this and the other parameters of fences are without effect
+    _real("FENCE_ALT_MAX", 100.0),  # m
+    _int8("FENCE_ENABLE", 0),
+    _real("FENCE_RADIUS", 150.0),  # m
+    _int8("FENCE_TYPE", 7),  # bit 0 height, bit 1 circle, bit 2 polygons
+    # modes of the mode switch's positions 1 to 6; without effect
+    *(_int8(f"FLTMODE{at}", mode) for at, mode in enumerate((7, 9, 6, 3, 5, 0), 1)),
     _int8("FLTMODE_CH", 5),  # channel of the mode switch
     _int8("FRAME_CLASS", 1),  # 1 quadrotor
     _int8("FRAME_TYPE", 0),  # 0 plus

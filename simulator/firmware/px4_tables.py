@@ -55,6 +55,13 @@ MODES = {
 }
 
 
+_GAINS = {
+    "PITCH_P": 6.5, "ROLL_P": 6.5, "YAW_P": 2.8, "PITCHRATE_P": 0.15, "PITCHRATE_I": 0.2,
+    "PITCHRATE_D": 0.003, "ROLLRATE_P": 0.15, "ROLLRATE_I": 0.2, "ROLLRATE_D": 0.003,
+    "YAWRATE_P": 0.2, "YAWRATE_I": 0.1, "YAWRATE_D": 0.0,
+}  # fmt: skip
+
+
 def _real(name: str, default: float, low: float, high: float) -> ParameterSpec:
     return ParameterSpec(name, "real32", default, low, high)
 
@@ -82,6 +89,8 @@ PARAMETERS = (
     _real("COM_OF_LOSS_T", 1.0, 0, 60),  # s without setpoint until offboard is lost
     # modes without failsafe when sticks are lost, bits: 0 mission, 1 hold and takeoff, 2 offboard
     _int("COM_RCL_EXCEPT", 0, 0, 31),
+    # modes of the mode switch's positions 1 to 6; without effect
+    *(_int(f"COM_FLTMODE{at}", -1, -1, 15) for at in range(1, 7)),
     _int("COM_RC_IN_MODE", 1, 0, 4),  # manual input: 0 RC, 1 joystick, 4 none
     _real("COM_RC_LOSS_T", 0.5, 0, 35),  # s without sticks until they are lost
     _int("COM_RC_OVERRIDE", 1, 0, 3),  # moved sticks end bit 0 automatic modes, bit 1 offboard
@@ -102,6 +111,7 @@ PARAMETERS = (
     _int("MAV_TYPE", 2, 0, 22),  # MAV_TYPE
     _real("MC_PITCHRATE_MAX", 220.0, 0, 1800),  # deg/s; without effect
     _real("MC_ROLLRATE_MAX", 220.0, 0, 1800),  # deg/s; without effect
+    *(_real(f"MC_{name}", gain, 0, 20) for name, gain in _GAINS.items()),  # without effect
     _real("MIS_DIST_1WP", 10000.0, -1, 100000),  # m to the first waypoint; without effect
     _real("MIS_TAKEOFF_ALT", 2.5, 0, 80),  # m, takeoff height
     _int("MIS_TKO_LAND_REQ", 0, 0, 4),  # what a mission must have

@@ -17,6 +17,7 @@ from sim_bench import NAN, Bench
 from simulator import config
 from simulator.autopilot.firmware import Firmware
 from simulator.firmware import FIRMWARES
+from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.px4 import PX4
 from simulator.firmware.px4_messages import COMPANION_RATES_HZ, GROUND_RATES_HZ
 from simulator.instance import Instance
@@ -201,11 +202,21 @@ def asked(bench: Bench, name: bytes) -> tuple[float, int]:
     return message.param_value, message.param_type
 
 
-@pytest.mark.parametrize("name", [b"FLW_TGT_DST", b"SYS_FAILURE_EN"])
-def test_px4_has_the_parameters_that_examples_of_mavsdk_set(name: bytes) -> None:
+@pytest.mark.parametrize(
+    ("firmware", "name", "value"),
+    [
+        (PX4, b"FLW_TGT_DST", 8.0),
+        (PX4, b"SYS_FAILURE_EN", 0.0),
+        (PX4, b"MC_YAWRATE_P", 0.2),
+        (ARDUPILOT, b"FENCE_RADIUS", 150.0),
+        (ARDUPILOT, b"FLTMODE4", 3.0),
+    ],
+)
+def test_parameters_that_examples_set_have_the_values_of_the_real_ones(
+    firmware: Firmware, name: bytes, value: float
+) -> None:
     """Without an answer MAVSDK repeats its requests for 6 s per parameter, then gives up."""
-    bench = Bench()
-    asked(bench, name)
+    assert asked(Bench(firmware=firmware), name)[0] == pytest.approx(value)
 
 
 def test_a_changed_parameter_is_reported_on_every_link() -> None:

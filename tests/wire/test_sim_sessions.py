@@ -299,10 +299,10 @@ def named(name: str, firmware: str) -> Session:
 @pytest.mark.parametrize(
     ("name", "firmware", "equal"),
     [
-        ("talk", "ardupilot", 48),
+        ("talk", "ardupilot", 51),
         ("failsafes", "ardupilot", 33),
         ("failsafes", "px4", 11),
-        ("ground", "px4", 75),  # also out of range, NaN, of another type and unknown
+        ("ground", "px4", 78),  # also out of range, NaN, of another type and unknown
     ],
 )
 def test_parameter_replies_match_the_real_autopilot(name: str, firmware: str, equal: int) -> None:
