@@ -115,10 +115,11 @@ class Mission:
         self.parameters.set("MIS_TOTAL", len(items))  # PX4 has no such parameter
         if not continues:
             self.reset()
+            self.finished = False
 
     def reset(self) -> None:
-        """Go back to the beginning."""
-        self.current, self.reached, self.finished = self.first, -1, False
+        """Go back to the beginning; a finished mission stays so until it begins again."""
+        self.current, self.reached = self.first, -1
         self.speed_mps, self._since_s = math.inf, math.nan
         self._jumps.clear()
 
@@ -175,6 +176,7 @@ class Mission:
         self.under_way = True
         if self.finished:
             self.reset()
+            self.finished = False
         self._tell()
         self._target_ned_m = here_ned_m
         self._since_s = self._climb_down_m = self._turned_rad = math.nan

@@ -95,8 +95,7 @@ PARAMETERS = (
     _int8("FENCE_ENABLE", 0),
     _real("FENCE_RADIUS", 150.0),  # m
     _int8("FENCE_TYPE", 7),  # bit 0 height, bit 1 circle, bit 2 polygons
-    # modes of the mode switch's positions 1 to 6; without effect
-    *(_int8(f"FLTMODE{at}", mode) for at, mode in enumerate((7, 9, 6, 3, 5, 0), 1)),
+    *(_int8(f"FLTMODE{at}", mode) for at, mode in enumerate((7, 9, 6, 3, 5, 0), 1)),  # no effect
     _int8("FLTMODE_CH", 5),  # channel of the mode switch
     _int8("FRAME_CLASS", 1),  # 1 quadrotor
     _int8("FRAME_TYPE", 0),  # 0 plus

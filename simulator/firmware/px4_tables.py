@@ -89,8 +89,7 @@ PARAMETERS = (
     _real("COM_OF_LOSS_T", 1.0, 0, 60),  # s without setpoint until offboard is lost
     # modes without failsafe when sticks are lost, bits: 0 mission, 1 hold and takeoff, 2 offboard
     _int("COM_RCL_EXCEPT", 0, 0, 31),
-    # modes of the mode switch's positions 1 to 6; without effect
-    *(_int(f"COM_FLTMODE{at}", -1, -1, 15) for at in range(1, 7)),
+    *(_int(f"COM_FLTMODE{at}", -1, -1, 15) for at in range(1, 7)),  # mode switch; without effect
     _int("COM_RC_IN_MODE", 1, 0, 4),  # manual input: 0 RC, 1 joystick, 4 none
     _real("COM_RC_LOSS_T", 0.5, 0, 35),  # s without sticks until they are lost
     _int("COM_RC_OVERRIDE", 1, 0, 3),  # moved sticks end bit 0 automatic modes, bit 1 offboard

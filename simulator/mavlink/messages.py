@@ -1,7 +1,6 @@
 """Builders of the messages that every firmware sends.
 
-A public function, or a row of ROWS, builds the message of its name: it returns the fields in the
-order of the XML.
+A public function, or a row of ROWS, returns the fields of the message of its name, in XML order.
 The builders of one firmware only are in `simulator.firmware.px4_messages` and
 `simulator.firmware.ardupilot_messages`. Knows no links, rates or sequence numbers.
 """
