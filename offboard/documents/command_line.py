@@ -30,7 +30,7 @@ def run(module: str, arguments: list[str] | None = None) -> NoReturn:
     interrupt. If the reader of the output has closed the pipe (`| head -1`), the exit code is 141
     and nothing is printed.
     """
-    for name in ("stdout", "stderr"):
+    for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:  # the parent process has closed it
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     # python-control imports matplotlib, which would warn about a HOME that cannot be written

@@ -211,11 +211,12 @@ def _take_off(flight: FlightState, time_s: float) -> None:
     if flight.takes_off_by_command:
         _request_takeoff(flight, time_s)
         return
-    age_s, rising_s, most = flight.vehicle.position_age_s, flight.in_phase_s, SPOOL_MAX
-    if age_s > SPOOL_KNOWN_S:
-        rising_s, most = rising_s - age_s, SPOOL_UNSEEN
-    spool = min(most, max(0.0, SPOOL_UP_PER_S * rising_s))
-    thrust_mps2 = spool * flight.model.gravity_mps2
+    gravity_mps2, reached_mps2 = flight.model.gravity_mps2, flight.command.thrust_mps2
+    ramp_mps3, most = SPOOL_UP_PER_S * gravity_mps2, SPOOL_UNSEEN
+    if flight.vehicle.position_age_s <= SPOOL_KNOWN_S:
+        reached_mps2 += 2.0 * ramp_mps3 * flight.period_s  # no leap after a gap of positions
+        most = SPOOL_MAX
+    thrust_mps2 = min(most * gravity_mps2, ramp_mps3 * flight.in_phase_s, reached_mps2)
     outbox.send_level(
         flight, time_s, Command(thrust_mps2, LEVEL_DIRECTION, flight.command.heading_rad)
     )

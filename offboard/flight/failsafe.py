@@ -84,8 +84,7 @@ def tilted(flight: FlightState) -> str:
     if flight.vehicle.attitude is None:
         return ""
     tilt_rad = math.acos(min(1.0, max(-1.0, float(flight.vehicle.thrust_direction_ned[2]))))
-    exceeds = tilt_rad > flight.limits.tilt_rad
-    return f"tilt {math.degrees(tilt_rad):.0f} deg" if exceeds else ""
+    return f"tilt {math.degrees(tilt_rad):.0f} deg" if tilt_rad > flight.limits.tilt_rad else ""
 
 
 def away_from_commands(flight: FlightState) -> str:

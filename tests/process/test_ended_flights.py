@@ -250,6 +250,12 @@ def imported(*arguments, **named):
 builtins.__import__ = imported
 """
 CLOSED = "import os; r, w = os.pipe(); os.close(r); os.dup2(w, 1)"
+NONE_OPEN = """
+import atexit, os
+atexit.register(lambda: os._exit(os.open(os.devnull, os.O_RDONLY)))  # the lowest free descriptor
+os.closerange(0, 3)
+sys.stdin = sys.stdout = sys.stderr = None
+"""
 
 
 @pytest.mark.parametrize(
@@ -258,7 +264,7 @@ CLOSED = "import os; r, w = os.pipe(); os.close(r); os.dup2(w, 1)"
         (IMPORTS, ["--help"], 130, "interrupted\n"),  # by the 100th import of `main`
         (CLOSED, ["score", str(RECORDING)], 141, ""),  # nobody reads it: as SIGPIPE
         (f"{CLOSED}; os.dup2(w, 2)", ["check", "nothere.yaml"], 2, ""),
-        ("sys.stdout = sys.stderr = None", ["check", "nothere.yaml"], 2, ""),
+        (NONE_OPEN, ["check", "nothere.yaml"], 3, ""),  # a log or socket must not become stderr
     ],
     ids=["interrupted import", "closed pipe", "closed pipe of both", "closed output"],
 )
