@@ -32,7 +32,7 @@ def run(module: str, arguments: list[str] | None = None) -> NoReturn:
     """
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:  # the parent process has closed it
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+            setattr(sys, name, open(os.devnull, "r+"))  # noqa: SIM115
     # python-control imports matplotlib, which would warn about a HOME that cannot be written
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     # escape characters that the encoding of the output does not have

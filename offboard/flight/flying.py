@@ -245,7 +245,7 @@ def requested(request: Request) -> Condition:
 FLOWN, REFUSED, ABORTED = ExitCode.FLOWN, ExitCode.REFUSED, ExitCode.ABORTED
 FAILSAFE = "{flight.failsafe.cause}", "{flight.failsafe.reason}"
 AT_START = "hovers at the start of the reference"
-HELD = "hold was requested for {flight.in_phase_s:.0f} s"
+HELD = "hold was requested {flight.in_phase_s:.0f} s ago"
 DID_NOT_HOLD = "the vehicle did not hold in {flight.in_phase_s:.0f} s"
 UNHEARD = "it stands on the ground, and no HEARTBEAT shows whether it is disarmed"
 RESTARTED = f"{REBOOTED} and is disarmed"

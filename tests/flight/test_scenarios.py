@@ -682,7 +682,7 @@ ROWS = {
     # arrived
     "the vehicle does not receive setpoints": ends(
         "15 TIMESYNC requests in a row were not answered: does the vehicle receive setpoints"
-        ".*; hold was requested for 2 s$",  # it does not say that the vehicle held
+        ".*; hold was requested 2 s ago$",  # it does not say that the vehicle held
         held_soon,
         fly=COPTER_HOVERS, failsafes=["uplink"], fall_mps=1.6, top_m=3.5,
         at=tracking(faults.cut(3.0, ways=["up"])),
