@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from offboard.model.frames import euler_from_quaternion
@@ -98,6 +98,11 @@ def rc_channels(view: View) -> Sequence[Any]:
     return (view.time_ms, len(widths_us), *widths_us, *(0,) * (18 - len(widths_us)), 255)
 
 
+def raw_imu(view: View) -> Sequence[Any]:
+    """True specific force in mg, estimated rates in mrad/s, magnetic field of SITL in mgauss."""
+    return (view.time_us, *view.scaled_imu, 224, 80, -528, 0, 2500)
+
+
 def servo_output_raw(view: View) -> Sequence[Any]:
     """Four equal motors, with MOT_THST_EXPO and MOT_SPIN_MIN to MOT_SPIN_MAX (0.15 to 0.95)."""
     demand = view.autopilot.position_controller.demand
@@ -152,11 +157,19 @@ def ahrs2(view: View) -> Sequence[Any]:
     return (*messages.attitude(view)[1:4], height_mm * 1e-3, latitude, longitude)
 
 
-ROWS: dict[str, Callable[[View], Sequence[Any]]] = {
-    "MEMINFO": lambda _: (0, 65535, 524288),
-    "POWER_STATUS": lambda _: (5000, 0, 0),
-    # true specific force in mg, estimated rates in mrad/s, magnetic field of SITL in mgauss
-    "RAW_IMU": lambda view: (view.time_us, *view.scaled_imu, 224, 80, -528, 0, 2500),
-    "SCALED_PRESSURE2": messages.scaled_pressure,
-    "WIND": lambda _: (-180.0, 0.0, 0.0),  # without an airspeed sensor, no wind is estimated
-}
+def meminfo(view: View) -> Sequence[Any]:
+    return (0, 65535, 524288)
+
+
+def power_status(view: View) -> Sequence[Any]:
+    """5 V."""
+    return (5000, 0, 0)
+
+
+def scaled_pressure2(view: View) -> Sequence[Any]:
+    return messages.scaled_pressure(view)
+
+
+def wind(view: View) -> Sequence[Any]:
+    """None: without an airspeed sensor, no wind is estimated."""
+    return (-180.0, 0.0, 0.0)

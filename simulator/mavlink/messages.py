@@ -1,6 +1,6 @@
 """Builders of the messages that every firmware sends.
 
-A public function, or a row of ROWS, returns the fields of the message of its name, in XML order.
+A public function builds the message of its name: it returns the fields in the order of the XML.
 The builders of one firmware only are in `simulator.firmware.px4_messages` and
 `simulator.firmware.ardupilot_messages`. Knows no links, rates or sequence numbers.
 """
@@ -8,7 +8,7 @@ The builders of one firmware only are in `simulator.firmware.px4_messages` and
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from simulator.autopilot.position_loop import level
@@ -54,6 +54,11 @@ def scaled_pressure(view: View) -> Sequence[Any]:
     down_m = view.autopilot.state.estimate.position_ned_m[2]
     height_m = view.autopilot.firmware.origin[2] - down_m
     return (view.time_ms, pressure_hpa(height_m), 0.0, 2500, 0)
+
+
+def vibration(view: View) -> Sequence[Any]:
+    """No vibration."""
+    return (view.time_us, 0.0, 0.0, 0.0, 0, 0, 0)
 
 
 def vfr_hud(view: View) -> Sequence[Any]:
@@ -140,6 +145,18 @@ def battery_status(view: View) -> Sequence[Any]:
     )  # fmt: skip
 
 
+def extended_sys_state(view: View) -> Sequence[Any]:
+    return (0, view.landed_state)
+
+
+def system_time(view: View) -> Sequence[Any]:
+    return (view.epoch_us + view.time_us, view.time_ms)
+
+
+def timesync(view: View) -> Sequence[Any]:
+    return (0, view.time_us * 1000)
+
+
 def home_position(view: View) -> Sequence[Any]:
     north, east, down = view.autopilot.guidance.home_ned_m
     return (
@@ -156,10 +173,18 @@ def home_position(view: View) -> Sequence[Any]:
     )
 
 
+def gps_global_origin(view: View) -> Sequence[Any]:
+    return (*view.geodetic(0.0, 0.0), view.altitude_mm(0.0), view.time_us)
+
+
 def mission_current(view: View) -> Sequence[Any]:
     """Current item, and number of items (65535 without a mission); PX4 leaves the rest at 0."""
     mission = view.autopilot.mission
     return (mission.current, len(mission.items) or 65535, 0, 0)
+
+
+def mission_item_reached(view: View) -> Sequence[Any]:
+    return (max(0, view.autopilot.mission.reached),)
 
 
 def autopilot_version(view: View) -> Sequence[Any]:
@@ -168,13 +193,3 @@ def autopilot_version(view: View) -> Sequence[Any]:
         firmware.capabilities, firmware.version, 0, 0, 0,
         (0,) * 8, (0,) * 8, (0,) * 8, 0, 0, view.system, (0,) * 18,
     )  # fmt: skip
-
-
-ROWS: dict[str, Callable[[View], Sequence[Any]]] = {
-    "EXTENDED_SYS_STATE": lambda view: (0, view.landed_state),
-    "GPS_GLOBAL_ORIGIN": lambda view: (*view.geodetic(0, 0), view.altitude_mm(0), view.time_us),
-    "MISSION_ITEM_REACHED": lambda view: (max(0, view.autopilot.mission.reached),),
-    "SYSTEM_TIME": lambda view: (view.epoch_us + view.time_us, view.time_ms),
-    "TIMESYNC": lambda view: (0, view.time_us * 1000),
-    "VIBRATION": lambda view: (view.time_us, 0.0, 0.0, 0.0, 0, 0, 0),
-}

@@ -27,8 +27,8 @@ INTERVAL_MAX_US = 2.0**31 - 1  # MESSAGE_INTERVAL.interval_us is an int32
 
 
 def _builders_in(module: ModuleType) -> dict[str, Builder]:
-    """Return the public functions and ROWS of a module, by the name of the message of each."""
-    return getattr(module, "ROWS", {}) | {
+    """Return the public functions of a module, by the name of the message that each builds."""
+    return {
         name.upper(): function
         for name, function in vars(module).items()
         if inspect.isfunction(function)
