@@ -81,6 +81,7 @@ class Flight(FlightState):
             outbox.send(self, *due, *replies)
         finally:
             self._inputs.end()
+        # after the turn was recorded: a replay has these datagrams only as calls
         self.overhear([each.data for each in chunks if self.session.peer not in (None, each.peer)])
         frames = outbox.flush(self)
         self._logged += frames

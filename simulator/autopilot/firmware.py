@@ -144,9 +144,7 @@ class Firmware(ABC):
     requests_kind_of_peer: bool = False  # requests items with or without _INT, as the peer last did
     # MAV_FRAME of a downloaded item, by its message and the MAV_FRAME of the upload
     item_frames: Mapping[str, Mapping[int, int]]
-    frameless_items: frozenset[int] = (
-        frozenset()
-    )  # MAV_CMDs of items that are downloaded in frame 0
+    frameless_items: frozenset[int] = frozenset()  # MAV_CMDs of items downloaded in frame 0
     mission_text: StatusText | None = None  # text after an upload
     # MAV_CMD -> name in the texts about the progress of a mission; without names there are none
     item_titles: Mapping[int, str] = field(default_factory=dict)
